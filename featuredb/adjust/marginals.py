@@ -189,8 +189,9 @@ def inverse_without_points(by_point: Any, by_shared: Any) -> FloatArray:
     factor, failed = dpotrf(normal, overwrite_a=1)
     if failed:
         raise LinAlgError("the normal matrix is not positive definite")
-    upper, _ = dpotri(factor, overwrite_c=1)
-    covariance = np.triu(upper) + np.triu(upper, 1).T
+    covariance, _ = dpotri(factor, overwrite_c=1)  # its upper triangle
+    for row in range(len(covariance)):
+        covariance[row + 1 :, row] = covariance[row, row + 1 :]
     covariance *= scale[:, None]
     covariance *= scale
     return np.asarray(covariance)
@@ -216,13 +217,12 @@ def points_by_shared(
 
 
 def marginals(covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int], block: Block) -> Marginals:
-    """Of the covariance of poses, in COLMAP's perturbation, and lenses."""
+    """Of the covariance of poses, in COLMAP's perturbation, and lenses, which is changed in place."""
     size = tuple(len(camera.params) for camera in block.cameras)
-    shared = covariance.copy()
     for row, k in enumerate(poses):
         turn, own = _house_from_colmap(block.cam_from_block[k].translation), slice(6 * row, 6 * row + 6)
-        shared[own] = turn @ shared[own]
-        shared[:, own] = shared[:, own] @ turn.T
+        covariance[own] = turn @ covariance[own]
+        covariance[:, own] = covariance[:, own] @ turn.T
     pose_start = np.full(len(block.names), -1, dtype=np.int64)
     pose_start[list(poses)] = 6 * np.arange(len(poses))
     lens_start, first = np.full(len(block.cameras), -1, dtype=np.int64), 6 * len(poses)
@@ -230,7 +230,7 @@ def marginals(covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int
         lens_start[c] = first
         first += size[c]
     return Marginals(
-        shared=shared,
+        shared=covariance,
         pose_start=pose_start,
         lens_start=lens_start,
         lens_size=size,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pycolmap import cost_functions
 from scipy import sparse
 
-from featuredb.adjust.lens_agreement import Weighted, honest, lens_disagreement
+from featuredb.adjust.lens_agreement import Weighted, diluted, lens_disagreement
 from featuredb.adjust.marginals import (
     Marginals,
     TargetMarginals,
@@ -154,9 +154,11 @@ class Problem:
         """Covariances as the residuals and the priors as they are have them, where `dilution` is a choice of
         weights (`featuredb.adjust.lens_agreement`); and `marginals`.
         """
-        (poses, lenses), block, weighted = self._free(), self.block(), self.weighted()
-        covariance, inverse = honest(weighted, lens_disagreement(weighted)), weighted.inverse
+        (poses, lenses), block, weighted = self._free(), self.block(), self._weighted()
+        disagreement, columns, inverse = lens_disagreement(weighted), weighted.lenses, weighted.inverse
         del weighted  # its Jacobian is large
+        of_priors = self._jacobian(self._shared(), self._diluted).toarray()
+        covariance = diluted(inverse, of_priors, self._terms.dilution, columns, disagreement)
         return marginals(covariance, poses, lenses, block), marginals(inverse, poses, lenses, block)
 
     def points_by_shared(self) -> tuple[NDArray[np.int64], Any, FloatArray]:
@@ -164,7 +166,7 @@ class Problem:
         moved, information = points_by_shared(*self._by_point_and_shared(), self._free()[0], self.block())
         return np.array(list(self._points), dtype=np.int64), moved, information
 
-    def weighted(self) -> Weighted:
+    def _weighted(self) -> Weighted:
         """The adjustment, linear at the parameters as they are now."""
         poses, lenses = self._free()
         by_point, by_shared = self._by_point_and_shared()
@@ -176,8 +178,6 @@ class Problem:
             residual=np.asarray(self._ceres.evaluate_residuals()) / self._terms.keypoint_px,
             inverse=inverse,
             lenses=[slice(int(a), int(b)) for a, b in pairwise(ends)],
-            of_priors=self._jacobian(self._shared(), self._diluted).toarray(),
-            dilution=self._terms.dilution,
         )
 
     def by_lens_priors(self, found: Marginals, cameras: Collection[int]) -> FloatArray:

@@ -49,22 +49,27 @@ def map_errors(block: Block, focal_px: Mapping[int, float], centers: CenterPrior
     block = whole_lens(block)
     terms = terms_of_map(block, focal_px, centers, options)
     found, weighted = Problem(block, terms, options.threads).honest_marginals()
-    joint = _joint(block, found)
+    # Photos agree on a wrong lens: parameters are off by more than poses made with them.
+    lenses = [options.dilution * weighted.lens(c) for c in range(len(block.cameras))]
+    photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
     size = 6 * len(block.names)
+    del weighted  # of 1,000 photos each of these matrices has 300 MB; what follows works in place
+    joint = _joint(block, found)
+    del found
     factor = _factor(joint, size)
-    noise = joint[:size, :size] - factor[:size] @ factor[:size].T
+    noise = joint[:size, :size]
+    noise -= factor[:size] @ factor[:size].T
     moved, fit = _similarity_of(block)
     factor[:size] -= moved @ (fit @ factor[:size])
     noise -= moved @ (fit @ noise)
     noise -= (noise @ fit.T) @ moved.T
-    poses = noise + factor[:size] @ factor[:size].T
     shear, depths = picture_shear(block), block.distances()
-    # Photos agree on a wrong lens: parameters are off by more than poses made with them.
-    lenses = [options.dilution * weighted.lens(c) for c in range(len(block.cameras))]
-    photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
+    by_lens = factor[:size].reshape(len(block.names), 6, factor.shape[1])
+    poses = np.array([noise[k : k + 6, k : k + 6] for k in range(0, size, 6)]).reshape(-1, 6, 6)
+    poses += by_lens @ np.swapaxes(by_lens, 1, 2)
     return MapErrors(
         lenses=uncertainty_of_lenses(block.cameras, lenses, photos, options.dilution),
-        poses=np.array([poses[k : k + 6, k : k + 6] for k in range(0, size, 6)]) + shear.hidden(depths),
+        poses=poses + shear.hidden(depths),
         modes=_modes(block, noise, factor, depths),
         shear=shear,
     )
@@ -129,16 +134,23 @@ def _similarity_of(block: Block) -> tuple[FloatArray, FloatArray]:
 
 
 def _modes(block: Block, noise: FloatArray, factor: FloatArray, depths: FloatArray) -> ErrorModes:
-    """The largest principal components of the poses' displacements, lenses as they go with them."""
+    """The largest principal components of the poses' displacements, lenses as they go with them.
+
+    `noise` is changed in place.
+    """
     count = len(block.names)
     size = 6 * count
     unit = np.ones((count, 6))
     unit[:, 3:] = 1.0 / depths[:, None]
     scaled = unit.ravel()[:, None] * factor[:size]
-    whole = unit.ravel()[:, None] * noise * unit.ravel() + scaled @ scaled.T
-    values, vectors = eigh(whole, subset_by_index=(max(0, size - _MOST_MODES), size - 1))
+    noise *= unit.ravel()[:, None]
+    noise *= unit.ravel()
+    noise += scaled @ scaled.T
+    variance = max(float(np.trace(noise)), 1e-300)
+    largest = (max(0, size - _MOST_MODES), size - 1)
+    values, vectors = eigh(noise, overwrite_a=True, subset_by_index=largest)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
-    together = np.cumsum(values) / max(float(np.trace(whole)), 1e-300)
+    together = np.cumsum(values) / variance
     kept = min(int(np.searchsorted(together, _KEPT)) + 1, int((values > 0.0).sum()))
     root = np.sqrt(values[:kept])
     lenses = factor[size:] @ (scaled.T @ (vectors[:, :kept] / root))
