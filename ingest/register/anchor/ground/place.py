@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import rel_entr
 from scipy.stats import binom
 
 from featuredb.geometry.arrays import FloatArray
@@ -30,7 +31,7 @@ _LOG_RATE = 3.0  # one map of a thousand that lies elsewhere is placed wrongly
 _RIVAL_RATE = 1e-3  # how often another place that is as good would agree in so many fewer blocks
 _AGREE_M, _NEAR_M = 0.3, 1.0  # of a point from the solid: across its plane, and from what is known of it
 _ABOVE_M = 1.0  # over the ground: the ground agrees everywhere
-_PLACE_M, _BLOCK_M = 1.0, 3.0  # sides of what counts as one place, and of what errs together
+_PLACE_M = 3.0  # side of what counts as one place: what lies closer together errs together
 _EYE_M = 1.6  # of people over the ground, from which a fit starts
 _NEAREST_M, _FURTHEST_M = 3.0, 100.0  # medians from which people take photos of fronts
 _COARSE, _ASKED, _FINE = 400, 1500, 4000  # points of a fit, of a place's evidence, of the last fit
@@ -144,10 +145,12 @@ def _chance(there: Sequence[_Tried]) -> FloatArray:
     return np.asarray(alike @ agreeing / np.maximum(alike @ places, 1.0))
 
 
-def _over(one: _Tried, rate: float) -> float:
-    """By how many deviations more agree than chance gives."""
-    expected = rate * one.evidence.places
-    return float((one.evidence.agreeing - expected) / np.sqrt(max(expected * (1.0 - rate), 1.0)))
+def _score(one: _Tried, rate: float) -> float:
+    """Logarithm of how much likelier what agrees is at its own share than at what chance gives; 0 below."""
+    places, agreeing = one.evidence.places, one.evidence.agreeing
+    if agreeing <= rate * places:
+        return 0.0
+    return float(rel_entr(agreeing, rate * places) + rel_entr(places - agreeing, (1.0 - rate) * places))
 
 
 def _start(plan: StreetPlan, shape: ScanShape, one: PlanTry) -> Sim3:
@@ -178,7 +181,7 @@ def _judged(
 ) -> GroundPlace:
     """The photos that lie there, fitted, and whether another place explains them as well."""
     chance = _chance(there)
-    scores = np.array([_over(one, share) for one, share in zip(there, chance, strict=True)])
+    scores = np.array([_score(one, share) for one, share in zip(there, chance, strict=True)])
     first = int(scores.argmax())
     rate = float(chance[first])
     kept = np.ones(len(unplaced.images), dtype=bool)
@@ -203,7 +206,7 @@ def _judged(
         for one, far in zip(there, away, strict=True)
         if far > _APART_M and abs(np.log(one.fit.local_from_own.scale / sim.scale)) < _ALIKE
     ]
-    best = sorted(others, key=lambda one: _over(one, rate))[-_RIVALS:]
+    best = sorted(others, key=lambda one: _score(one, rate))[-_RIVALS:]
     rivals = (_rival_p(plan, shape, rows, sim, one.fit.local_from_own) for one in best)
     rival = max(rivals, default=0.0)
     figures = {"photos": int(kept.sum()), "of": len(kept), "rate": rate, "log_nfa": log_nfa, "rival": rival}
@@ -231,7 +234,9 @@ def _judged(
 def _log_nfa(best: float, elsewhere: FloatArray) -> float:
     """-log10 of how many of so many places elsewhere would agree as well.
 
-    Their tail is exponential, by a mean that its members tell no better than so many can (Lomax).
+    The tail of logarithms of likelihoods is exponential, of mean 1 where all points of a map err by
+    themselves, and of more as they err together: a mean that its members tell no better than so many can
+    (Lomax).
     """
     if len(elsewhere) < _LEAST_TRIES:
         return 0.0
@@ -253,7 +258,7 @@ def _best_around(plan: StreetPlan, shape: ScanShape, best: _Tried, rate: float) 
     for size in (-_AGAIN_SIZE, _AGAIN_SIZE):
         starts.append(Sim3.exp([size, *[0.0] * 6]).about(best.fit.middle) @ sim)
     tried = [_asked(shape, _fitted(plan, shape, start, rows, _COARSE_WIDTHS_M)) for start in starts]
-    return max(tried, key=lambda one: _over(one, rate))
+    return max(tried, key=lambda one: _score(one, rate))
 
 
 def _rows_seen(unplaced: UnplacedMap, plan: StreetPlan, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -298,7 +303,7 @@ def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: S
     """How often a place as good as another would agree in so many more blocks of the map."""
     own, rival = (_asked(shape, laid(shape, plan.points[rows], of)) for of in (sim, other))
     counted = own.above
-    block = np.floor(sim.act(plan.points[rows[counted]]) / _BLOCK_M).astype(np.int64)
+    block = np.floor(sim.act(plan.points[rows[counted]]) / _PLACE_M).astype(np.int64)
     group = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
     more = np.bincount(group, own.agrees[counted]) - np.bincount(group, (rival.agrees & rival.above)[counted])
     size = np.bincount(group)
@@ -310,7 +315,7 @@ def _covariance(final: _Tried) -> tuple[FloatArray, float]:
     """(7, 7) of the left perturbation: neighbours err together, outlines by one offset, all within a cell."""
     fit, agrees = final.fit, final.agrees
     rms_m = float(np.sqrt(np.mean(np.square(fit.off_m[agrees])))) if agrees.any() else _AGREE_M
-    blocks = len(np.unique(np.floor(fit.placed[agrees] / _BLOCK_M).astype(np.int64), axis=0))
+    blocks = len(np.unique(np.floor(fit.placed[agrees] / _PLACE_M).astype(np.int64), axis=0))
     factor = max(1.0, np.count_nonzero(agrees) / max(blocks, 1))
     inverse = np.linalg.inv(fit.normal + np.diag([1e-6] * 7))
     offset = inverse @ fit.by_walls * _WALL_SIGMA_M
