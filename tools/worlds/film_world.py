@@ -81,7 +81,7 @@ class FlightPath:
 
     def __init__(self, scene: Scene, options: PathOptions) -> None:
         rng = np.random.default_rng((options.seed, 71))
-        self._options, self._turn = options, scene.enu_from_town
+        self._turn = scene.enu_from_town
         times, places = _waypoints(scene, options, rng)
         self._place = CubicSpline(times, places)
         down = rng.uniform(*options.down_deg, len(times))
@@ -89,7 +89,9 @@ class FlightPath:
             over = np.abs(places[:, 1] - np.mean(scene.plan.river)) < 15.0
             down[over] = options.down_deg[1] + 10.0
         self._pitch = PchipInterpolator(times, -down)
-        self._heading = PchipInterpolator(times, _headings(places))
+        # From each place's last neighbour to its next: along its way it would spin where that turns back.
+        away = np.gradient(places[:, :2], axis=0)
+        self._heading = PchipInterpolator(times, np.degrees(np.unwrap(np.arctan2(away[:, 0], away[:, 1]))))
         self._gusts = _Gusts(rng) if options.style == "jerky" else None
         self._snaps = _snaps(options, rng) if options.style == "jerky" else []
 
@@ -105,8 +107,7 @@ class FlightPath:
             place, heading, pitch, roll = place + shift, heading + turn[0], pitch + turn[1], turn[2]
         # Headings are those of the town's axes, turned against north with them.
         town = look_pose(place, float(heading), pitch, float(roll))
-        rotation = town.rotation @ self._turn.T
-        return Rigid3(rotation=rotation, translation=-rotation @ (self._turn @ place))
+        return Rigid3.from_center(town.rotation @ self._turn.T, self._turn @ place)
 
 
 class _Gusts:
@@ -129,8 +130,7 @@ def _waypoints(scene: Scene, options: PathOptions, rng: np.random.Generator) -> 
     times, places = [-4.0], [_inside(options, rng)]
     at_river = int(options.duration_s / (2.0 * np.mean(_LEG_S))) + 1
     while times[-1] < options.duration_s + 4.0:
-        leg = float(rng.uniform(*_LEG_S))
-        reach = options.speed_m_s * leg
+        reach = options.speed_m_s * float(rng.uniform(*_LEG_S))
         before = places[-1]
         candidates = np.array([_inside(options, rng) for _ in range(40)])
         off = np.abs(np.linalg.norm(candidates[:, :2] - before[:2], axis=1) - reach)
@@ -141,15 +141,6 @@ def _waypoints(scene: Scene, options: PathOptions, rng: np.random.Generator) -> 
         times.append(times[-1] + float(np.linalg.norm(chosen - before)) / options.speed_m_s + 0.3)
         places.append(chosen)
     return np.array(times), np.array(places)
-
-
-def _headings(places: FloatArray) -> FloatArray:
-    """(n,) degrees clockwise from the town's north, from each place's last neighbour to its next, unwrapped.
-
-    A camera that turns with its way would spin where the way turns back.
-    """
-    away = np.gradient(places[:, :2], axis=0)
-    return np.asarray(np.degrees(np.unwrap(np.arctan2(away[:, 0], away[:, 1]))), dtype=np.float64)
 
 
 def _inside(options: PathOptions, rng: np.random.Generator) -> FloatArray:
@@ -385,9 +376,7 @@ def write_frames(
 
 def _bands(height: int, readout_s: float) -> list[tuple[int, int, float]]:
     """Rows (first, last + 1) that are exposed together, and how much later than the frame's middle."""
-    if readout_s == 0:
-        return [(0, height, 0.0)]
-    edges = np.linspace(0, height, _BANDS + 1).round().astype(int).tolist()
+    edges = np.linspace(0, height, (_BANDS if readout_s else 1) + 1).round().astype(int).tolist()
     return [
         (top, bottom, readout_s * (0.5 * (top + bottom) / height - 0.5)) for top, bottom in pairwise(edges)
     ]

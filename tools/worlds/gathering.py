@@ -210,8 +210,6 @@ def plan_visits(
         kind: of the facts; by default street or drone.
     """
     rng = np.random.default_rng((seed, 52))
-    if not places:
-        raise InvalidValueError(f"plan_visits: no sight of {scene.name} can be photographed")
     around = Surroundings(scene)
     shares = np.array([p.weight for p in people]) / sum(p.weight for p in people)
     taken_by = np.zeros(len(people))
@@ -229,9 +227,7 @@ def plan_visits(
         photos += taken[: count - len(photos)]
         visit += 1
         if visit - first_visit > _VISIT_TRIES * max(count, 50):
-            raise InvalidValueError(
-                f"plan_visits: only {len(photos)} of {count} photos came of {visit} visits"
-            )
+            raise InvalidValueError(f"plan_visits: {len(photos)} of {count} photos came of {visit} visits")
     return photos
 
 

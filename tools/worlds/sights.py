@@ -108,8 +108,9 @@ def find_sights(
     return sights
 
 
-def _inside(point: tuple[float, float, float], rect: Rect) -> bool:
-    return rect[0] <= point[0] <= rect[2] and rect[1] <= point[1] <= rect[3]
+def lies_in(rect: Rect, x: float, y: float) -> bool:
+    """Whether a place is in a rectangle, town axes."""
+    return rect[0] <= x <= rect[2] and rect[1] <= y <= rect[3]
 
 
 Target = tuple[tuple[float, float, float], float, float]
@@ -129,7 +130,7 @@ def _named_targets(scene: Scene, within: Rect | None, rng: np.random.Generator) 
         if s.along == "y":
             targets.append(((s.at, 0.5 * sum(scene.plan.river), 0.8), 8.0, 3.0))
     if within is not None:
-        targets, houses = ([t for t in those if _inside(t[0], within)] for those in (targets, houses))
+        targets, houses = ([t for t in those if lies_in(within, *t[0][:2])] for those in (targets, houses))
     picked = rng.permutation(len(houses))[: max(8, len(houses) // 10)]
     return targets + [houses[int(i)] for i in picked]
 
