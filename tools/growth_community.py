@@ -7,9 +7,8 @@ wrong by kilometres; another town's photos, re-uploads, rooms and faces among th
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
 most of the photos, as on photo sites.
 
-Exit code 0 if at least 70 % of the town's photos are in
-active maps with a median error of at most 0.30 m, none of another town or of nowhere, and none is wrong by
-more than 2 m.
+Exit code 0 if at least 70 % of the town's photos are in active maps with a median error of at most 0.30 m,
+none of another town or of nowhere, and none is wrong by more than 2 m.
 """
 
 import sys
@@ -37,7 +36,7 @@ _SHARE, _MEDIAN_M = 0.70, 0.30
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args, world = world_told(__doc__, argv, 1, CommunityOptions)
+    args, world = world_told(__doc__, argv, CommunityOptions)
     album = made(community_album, args.work / "world", world)
     database = anchored(args.work / "db", album, "survey")
     give(database, album, album.of(*_OWN, *_FOREIGN, "copy"))
@@ -57,8 +56,7 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
     pictures = {r.fact.name for r in mine} | {r.fact.copy_of for r in active if r.fact.kind == "copy"}
     share = len(pictures & {f.name for f in own}) / max(len(own), 1)
     errors = [r.error_m for r in mine]
-    middle = median(errors)
-    worst = max(errors, default=float("nan"))
+    middle, worst = median(errors), max(errors, default=float("nan"))
     return [
         Verdict(
             "registered",

@@ -17,7 +17,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -65,11 +65,7 @@ class Judgement:
 
 @contextmanager
 def recorded(path: Path, frame: LocalFrame, true_place: TruePlace) -> Iterator[None]:
-    """Append every judgement of growth to a file as long as it lasts.
-
-    Args:
-        frame: of the true places.
-    """
+    """Append every judgement of growth to a file as long as it lasts; `frame`: of the true places."""
     with ExitStack() as stack, path.open("a", encoding="utf-8") as file:
         note = _Note(file=file, frame=frame, true_place=true_place)
         for module, name, wrapped in (
@@ -147,13 +143,8 @@ class _Note:
         for name, center in zip(names, centers, strict=True):
             true = self._true_place(name)
             wrong += true is None or float(np.linalg.norm(center - true)) > WRONG_M
-        line = {
-            "step": step,
-            "key": " ".join(sorted(names)),
-            "right": len(names) - wrong,
-            "wrong": wrong,
-            "gates": gates,
-        }
+        right, key = len(names) - wrong, " ".join(sorted(names))
+        line = asdict(Judgement(step=step, key=key, right=right, wrong=wrong, gates=gates))
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
 

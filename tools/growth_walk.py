@@ -80,7 +80,7 @@ class Step:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args, world = world_told(__doc__, argv, 2, WalkOptions)
+    args, world = world_told(__doc__, argv, WalkOptions)
     album = made(plan_walk, args.work / "world", world)
     database = anchored(args.work / "db", album, "survey")
     steps = []
@@ -101,39 +101,34 @@ def measure(database: Database, album: Album, batch: int) -> Step:
         step=batch,
         reach_m=max((_along(album, r.fact) - edge for r in active), default=0.0),
         drift_m=max((r.drift_m or 0.0 for r in active), default=0.0),
-        ratio=worst_map(active)[1],
+        ratio=worst_ratio(active),
         stopped=waiting["DRIFT_BUDGET"],
         failed=waiting["FAILED"],
         probes=tuple(ask_probes(database, album, batch)),
     )
 
 
-def worst_map(found: Sequence[Registered]) -> tuple[float, float]:
-    """True error of the map that is worst against its bound on Earth, and the ratio of the two."""
-    worst = (0.0, 0.0)
+def worst_ratio(found: Sequence[Registered]) -> float:
+    """True error of the map that is worst against its bound on Earth, over that bound."""
+    ratios = [0.0]
     for map_id in {r.map_id for r in found}:
         mine = [r for r in found if r.map_id == map_id and r.offset_m is not None]
         true = float(np.linalg.norm(np.median([r.offset_m for r in mine], axis=0)))
-        ratio = true / max(mine[0].bound_m, 1e-6)
-        worst = max(worst, (true, ratio), key=lambda pair: pair[1])
-    return worst
+        ratios.append(true / max(mine[0].bound_m, 1e-6))
+    return max(ratios)
 
 
 def ask_probes(database: Database, album: Album, upto: int) -> list[Probe]:
     """Ask for every probe of the steps so far."""
     localiser = Localiser.open(database)
     probes = []
-    for fact in album.of("probe"):
-        if fact.batch > upto:
-            continue
+    for fact in (fact for fact in album.of("probe") if fact.batch <= upto):
         pose = answer_of(localiser, album.folder / fact.name).pose
         error, normalised = None, None
         if pose is not None:
-            true = album.truth.images[fact.name].cam_from_local.center
             center = album.truth.frame.enu_from(pose.frame).act(pose.cam_from_local.center)
-            offset = center - true
-            error = float(np.linalg.norm(offset))
-            normalised = squared(offset, pose.covariance[3:, 3:])
+            offset = center - album.truth.images[fact.name].cam_from_local.center
+            error, normalised = float(np.linalg.norm(offset)), squared(offset, pose.covariance[3:, 3:])
         probes.append(Probe(error_m=error, normalised=normalised))
     return probes
 
@@ -156,13 +151,10 @@ def second_anchor(database: Database, album: Album) -> tuple[Step, int]:
 def judge(steps: Sequence[Step], end: Step, commits: int, world: WalkOptions) -> list[Verdict]:
     """The contract's lines."""
     wanted = world.end_m - world.start_m - _SURVEYS_M
-    reach = max((s.reach_m for s in steps), default=0.0)
+    reach, ratio, over = (max(getattr(s, name) for s in steps) for name in ("reach_m", "ratio", "drift_m"))
     stopped = next((s for s in steps if s.stopped), None)
-    ratio = max((s.ratio for s in steps), default=0.0)
-    over = max((s.drift_m for s in steps), default=0.0)
-    asked = [p for p in steps[-1].probes if p.normalised is not None] if steps else []
-    inside = sum((p.normalised or 0.0) <= _INSIDE for p in asked)
-    mean = float(np.mean([p.normalised or 0.0 for p in asked])) if asked else float("nan")
+    asked = [p.normalised for p in steps[-1].probes if p.normalised is not None]
+    inside = sum(value <= _INSIDE for value in asked)
     answers = [p.error_m for s in (*steps, end) for p in s.probes if p.error_m is not None]
     errors = [p.error_m for p in end.probes if p.error_m is not None]
     whole = reach >= world.end_m - world.start_m
@@ -178,11 +170,12 @@ def judge(steps: Sequence[Step], end: Step, commits: int, world: WalkOptions) ->
         Verdict(
             "true error inside the bound",
             f"at most {ratio:.2f} of the 95 % on Earth at every step",
-            bool(steps) and ratio <= 1.0,
+            ratio <= 1.0,
         ),
         Verdict(
             "probes inside their 95 %",
-            f"{inside} of {len(asked)} along the whole way; mean squared normalised error {mean:.1f}",
+            f"{inside} of {len(asked)} along the whole way; mean squared normalised error "
+            f"{np.mean(asked):.1f}",
             bool(asked) and inside >= _PROBE_SHARE * len(asked),
         ),
         Verdict(
