@@ -96,12 +96,11 @@ def track_figures(tracks: Mapping[str, Trajectory], truth: FilmsTruth) -> dict[s
         poses = [one.pose for one in truth.films[film]]
         frames += sum(pose is not None for pose in poses)
         off = axis_errors(trajectory, truth.frame, poses)
-        for point, error in zip(trajectory.points, off, strict=True):
-            if point.pose is not None and np.isfinite(error).all():
-                metres.append(np.linalg.norm(error[3:]))
-                squares.append(squared(error, point.pose.covariance))
-            elif point.pose is not None:
-                foreign += 1
+        found = [(p.pose, e) for p, e in zip(trajectory.points, off, strict=True) if p.pose is not None]
+        shown = [(pose, error) for pose, error in found if np.isfinite(error).all()]
+        foreign += len(found) - len(shown)
+        metres += [np.linalg.norm(error[3:]) for _, error in shown]
+        squares += [squared(error, pose.covariance) for pose, error in shown]
     share = len(metres) / max(frames, 1)
     return {
         "place_frames": frames,
@@ -119,11 +118,8 @@ def map_figures(
     truth: FilmsTruth,
     scripts: Sequence[Script],
 ) -> dict[str, int]:
-    """Shots of the place, of which most keyframes are in maps of it; what is in them beside; losses.
-
-    Args:
-        maps: keyframes by map. told: the report of the ingest.
-    """
+    """Shots of the place, of which most keyframes are in maps of it (`maps`: keyframes by map); what is in
+    them beside; losses, by the report of the ingest."""
     shots = {(f"{s.name}.mp4", n): span for s in scripts for n, span in s.shots_s().items()}
     mapped = {k.image for keyframes in maps.values() for k in keyframes}
     left = [_keyframe(p["name"], truth, p["reason"]) for p in told["photos"] if p["name"] not in mapped]

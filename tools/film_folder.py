@@ -100,10 +100,8 @@ def six_films(seed: int) -> tuple[Script, ...]:
         return replace(film, cut=(0, film.frames))
 
     black = Card(15)
-    tour = (
-        Card(30, "THE OLD TOWN"),
-        *(flight(42.0, 50.0, 5.6, 0.757), black, flight(48.0, 60.0, 5.6, 0.757)),
-    )
+    old = Card(30, "THE OLD TOWN")
+    tour = (old, flight(42.0, 50.0, 5.6, 0.757), black, flight(48.0, 60.0, 5.6, 0.757))
     low = (flight(32.0, 40.0, 6.4, 0.62, speed=5.0), flight(38.0, 46.0, 5.0, 0.62, speed=5.0))
     abroad = (Card(30, "FAR AWAY"), elsewhere(8.8, 0.7))
     best = (flight(44.0, 54.0, 5.6, 0.9), elsewhere(4.0, 0.9), flight(50.0, 60.0, 5.6, 0.9))
@@ -119,12 +117,8 @@ def six_films(seed: int) -> tuple[Script, ...]:
 
 
 class FrameTruth(NamedTuple):
-    """A frame of a film.
-
-    Attributes:
-        piece: what it belongs to. camera: true intrinsics; None where no camera saw it.
-        pose: cam_from_local; None where it does not show the place.
-    """
+    """A frame of a film: the piece that it belongs to, true intrinsics (None where no camera saw it), and
+    cam_from_local (None where it does not show the place)."""
 
     piece: int
     camera: Camera | None = None

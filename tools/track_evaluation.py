@@ -82,13 +82,11 @@ def main() -> None:
 
 def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
     """What a film is tracked by: its map, or its scan from a coarse first pose."""
-    maps = Localiser.open(Database.open(database)).areas
     if what == "map":
-        return MapFinder(maps)
+        return MapFinder(Localiser.open(Database.open(database)).areas)
     (scan,) = list_scans(Database.open(database))
     cloud = load_cloud(Database.open(database), truth.frame, scan_ids=[scan.scan_id])
-    first = truth.cam_from_local[0]
-    start = off_pose(first, np.random.default_rng((_SEED, 5)), _START_M, _START_DEG)
+    start = off_pose(truth.cam_from_local[0], np.random.default_rng((_SEED, 5)), _START_M, _START_DEG)
     prior = FramePrior.around(start, _START_M, _START_DEG)
     return ScanFinder(cloud, scan.scan_id, truth.epsg, prior)
 
@@ -96,13 +94,8 @@ def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
 def film_options(name: str, frames: int) -> FilmOptions:
     style: FlightStyle = "jerky" if name == "jerky" else "smooth"
     path = PathOptions(seed=_SEED, style=style, half_extent_m=(32.0, 26.0))
-    cut = tuple(round(share * frames) for share in _CUT) if name == "cut" else None
-    return FilmOptions(
-        world=WorldOptions.short(_SEED),
-        path=path,
-        frames=frames,
-        cut=None if cut is None else (cut[0], cut[1]),
-    )
+    cut = (round(_CUT[0] * frames), round(_CUT[1] * frames)) if name == "cut" else None
+    return FilmOptions(world=WorldOptions.short(_SEED), path=path, frames=frames, cut=cut)
 
 
 def smooth_film(inputs: Path) -> tuple[Path, FilmTruth]:
@@ -118,13 +111,11 @@ def axis_errors(
     """(n, 6) of every frame, east-north-up: rotation (rad) before displacement (m); NaN without a pose."""
     off = np.full((len(trajectory.points), 6), np.nan)
     for row, point in enumerate(trajectory.points):
-        true = cam_from_local[point.index]
-        if point.pose is None or true is None:
-            continue
-        center = frame.enu_from_utm(point.pose.utm, point.pose.epsg)
-        grid = frame.grid_from_enu(center, point.pose.epsg)
-        rotation = matrix_from_quaternion(point.pose.cam_from_utm_xyzw) @ grid
-        off[row] = [*so3_log(rotation.T @ true.rotation), *(center - true.center)]
+        pose, true = point.pose, cam_from_local[point.index]
+        if pose is not None and true is not None:
+            center = frame.enu_from_utm(pose.utm, pose.epsg)
+            rotation = matrix_from_quaternion(pose.cam_from_utm_xyzw) @ frame.grid_from_enu(center, pose.epsg)
+            off[row] = [*so3_log(rotation.T @ true.rotation), *(center - true.center)]
     return off
 
 
@@ -142,8 +133,6 @@ def judge_film(tracked: TrackedVideo, truth: FilmTruth, most: int = _END) -> dic
     off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
     metres = np.linalg.norm(off[:, 3:], axis=1)
     known = np.isfinite(metres)
-    if not known.any():
-        raise SystemExit(f"track_evaluation: no frame of {tracked.trajectory.source} has a pose")
     m = metres[known]
     end = min(most, max(len(m) // 2, 1))  # ends that overlap could not differ
     return {
@@ -162,22 +151,13 @@ def judge_film(tracked: TrackedVideo, truth: FilmTruth, most: int = _END) -> dic
 
 def _inside(trajectory: Trajectory, off: FloatArray) -> dict[str, float]:
     """How true the bounds are: the last figures of `judge_film`."""
-    rows = [k for k in range(len(off)) if np.isfinite(off[k]).all()]
-    points = [trajectory.points[k] for k in rows]
-    few = np.argsort([p.inliers for p in points], kind="stable")[: (len(points) + 3) // 4]
+    found = [(p, error) for p, error in zip(trajectory.points, off, strict=True) if np.isfinite(error).all()]
+    few = np.argsort([p.inliers for p, _ in found], kind="stable")[: (len(found) + 3) // 4]
     figures: dict[str, float] = {}
-    for name, part in (("orientation", slice(0, 3)), ("position", slice(3, 6))):
-        squares = np.array(
-            [
-                squared(off[k, part], p.pose.covariance[part, part])
-                for k, p in zip(rows, points, strict=True)
-                if p.pose is not None
-            ]
-        )
+    for name, k in (("orientation", slice(0, 3)), ("position", slice(3, 6))):
+        squares = np.array([squared(error[k], p.pose.covariance[k, k]) for p, error in found])
         figures |= {f"{name}_95": inside(squares, 0.95), f"few_{name}_95": inside(squares[few], 0.95)}
-        if name == "position":
-            figures |= {"squared": float(squares.mean()), "few_squared": float(squares[few].mean())}
-    return figures
+    return figures | {"squared": float(squares.mean()), "few_squared": float(squares[few].mean())}
 
 
 def _found_s(truth: FilmTruth, known: NDArray[np.bool_]) -> float:
