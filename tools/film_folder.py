@@ -14,7 +14,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.writer import VideoWriterOptions
-from tools.worlds.film_world import Exposure, FilmOptions, PathOptions, film_frame, film_truth, write_frames
+from tools.worlds.film_world import FilmOptions, PathOptions, film_frame, film_truth, write_frames
 
 WIDTH, HEIGHT, RATE_HZ = 960, 540, 25.0
 _GOOD_CRF, _BAD_CRF, _WORSE_CRF = 20, 34, 37
@@ -89,7 +89,7 @@ def six_films(seed: int) -> tuple[Script, ...]:
             rate_hz=RATE_HZ,
             width=WIDTH,
             height=HEIGHT,
-            exposure=Exposure(samples=1),
+            samples=1,
             ev_range=0.0,
             focal=focal,
             zoom=zoom,
@@ -159,7 +159,7 @@ def film_picture(script: Script, frame: int) -> Image8:
     piece = script.pieces[number]
     if isinstance(piece, Card):
         return _card(piece.text)
-    picture = film_frame(replace(piece, exposure=replace(piece.exposure, ev=script.ev)), at)
+    picture = film_frame(replace(piece, ev=script.ev), at)
     bar = round(script.bars * HEIGHT)
     if bar:
         picture[:bar] = picture[-bar:] = 0

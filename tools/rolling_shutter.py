@@ -1,7 +1,5 @@
 """Photos of a rolling shutter, placed by positions alone: what answers, and is it inside its bounds?
 
-    python -m tools.rolling_shutter --work FOLDER [--inputs FOLDER]
-
 1. One frame a second of the simulated films, smooth and jerky, whose rows are read out over 30 ms.
 2. Each flight is ingested as photos with EXIF, by a drone's receiver (1.5 m that wander, 0.3 s late) and by
    RTK (2 cm, stated).
@@ -27,7 +25,6 @@ from tools.figures import say, study_parser, write_figures
 from tools.laser_truth import camera_squares
 from tools.photo_files import with_place
 from tools.worlds.film_world import (
-    Exposure,
     FilmOptions,
     FlightPath,
     FlightStyle,
@@ -76,7 +73,8 @@ def film_options(style: FlightStyle, seed: int) -> FilmOptions:
         rate_hz=1.0,
         width=960,
         height=540,
-        exposure=Exposure(samples=2, readout_s=_READOUT_S),
+        samples=2,
+        readout_s=_READOUT_S,
     )
 
 

@@ -157,29 +157,16 @@ def _snaps(options: PathOptions, rng: np.random.Generator) -> list[tuple[float, 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Exposure:
-    """How a frame is exposed.
-
-    Attributes:
-        samples: pictures of its time, in which what moves is blurred, that are averaged; each looks through
-            other parts of the pixels.
-        readout_s: rolling shutter, from the first row to the last; the frame's time is its middle row's.
-        ev: stops brighter than the scene is.
-    """
-
-    samples: int = 4
-    readout_s: float = 0.0
-    ev: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FilmOptions:
     """What to write. The same options give the same frames.
 
     Attributes:
         world: whose town is filmed. path: how the camera flies; its duration is that of the frames.
         frames, rate_hz: of the film. width, height: pixels.
-        exposure: of a frame, but for what follows.
+        samples: pictures of a frame's time, in which what moves is blurred, that are averaged; each looks
+            through other parts of the pixels.
+        readout_s: rolling shutter, from the first row to the last; the frame's time is its middle row's.
+        ev: stops brighter than the scene is.
         ev_range: stops between the darkest and the brightest exposure, which follow each other slowly, and
             leap once where the flight is jerky.
         focal: of the lens, in widths of the picture. zoom: what it becomes in the middle third of the film.
@@ -192,7 +179,9 @@ class FilmOptions:
     rate_hz: float = 30.0
     width: int = 1280
     height: int = 720
-    exposure: Exposure = field(default_factory=Exposure)
+    samples: int = 4
+    readout_s: float = 0.0
+    ev: float = 0.0
     ev_range: float = 0.7
     focal: float = 0.757
     zoom: float | None = None
@@ -278,7 +267,7 @@ def film_truth(options: FilmOptions) -> FilmTruth:
 
 def film_frame(options: FilmOptions, frame: int) -> Image8:
     """One frame (h, w, 3) uint8 RGB as the camera's sensor gives it."""
-    home, time_s, n = options.at_home(frame), options.time_s(frame), options.exposure.samples
+    home, time_s, n = options.at_home(frame), options.time_s(frame), options.samples
     scene, path, camera = _scene(options, home), _path(options, home), options.camera_at(frame)
     look = scene_look(scene, water_seed=int(time_s * _GLITTER_HZ))
     faces = Faces.concatenate([scene.faces, moving_cars(scene, options.path.seed, time_s=time_s)])
@@ -287,7 +276,7 @@ def film_frame(options: FilmOptions, frame: int) -> Image8:
         moment_s = time_s + _SHUTTER_S * ((k + 0.5) / n - 0.5)
         # Another part of each pixel: a rank-1 lattice over its square.
         shift = (float((k + 0.5) / n - 0.5), float((k * 0.618034 + 0.5 / n) % 1.0 - 0.5))
-        for top, bottom, later_s in _bands(camera.height, options.exposure.readout_s):
+        for top, bottom, later_s in _bands(camera.height, options.readout_s):
             f, cx, cy, *rest = camera.params
             params = (f, cx - shift[0], cy - shift[1] - top, *rest)
             part = replace(camera, height=bottom - top, params=params)
@@ -312,7 +301,7 @@ def wandering_errors(rng: np.random.Generator, sigma_m: float, keep: float, coun
 def _exposure_ev(options: FilmOptions, time_s: float) -> float:
     slow = 0.5 * options.ev_range * np.sin(2.0 * np.pi * time_s / 17.0)
     leaps = options.path.style == "jerky" and time_s > 0.6 * options.frames / options.rate_hz
-    return float(options.exposure.ev + slow + (0.6 * options.ev_range if leaps else 0.0))
+    return float(options.ev + slow + (0.6 * options.ev_range if leaps else 0.0))
 
 
 @lru_cache(maxsize=2)
