@@ -1,7 +1,5 @@
 """A long flight over a simulated town: its cost beside that of its first part, and how right its maps are.
 
-    python -m tools.bulk_ingest --work FOLDER [--seed N] [--json FILE]
-
 The town has houses that look alike, and positions are a receiver's. Each ingest is a process of its own with
 two workers; processor time and the largest process are those of all that it started.
 Of the verified pairs it prints how many are wrong, and which are left out (`tools.far_pairs`).
@@ -18,7 +16,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import WorldOptions, read_truth, write_world
-from tools.commands import all_maps, once, processor_s
+from tools.commands import all_maps, cost_of, once
 from tools.far_pairs import FEATURES, against_truth, verified_pairs
 from tools.figures import laid_apart, median, say, study_parser, write_figures
 from tools.photo_files import copied
@@ -55,9 +53,9 @@ def _ingested(work: Path, folder: Path) -> dict[str, float]:
     database = work / f"{folder.name}.db"
     shutil.rmtree(database, ignore_errors=True)
     words = ("ingest", "photos", str(database), str(folder), "--max-features", str(FEATURES), "--quiet")
-    seconds, largest_mb, told = processor_s("-m", "featuredb.cli", *words, "--workers", "2")
-    say(told)
-    return {"a_photo_s": seconds / len(list(folder.iterdir())), "largest_mb": largest_mb}
+    cost = cost_of("-m", "featuredb.cli", *words, "--workers", "2")
+    say(cost.told)
+    return {"a_photo_s": cost.seconds / len(list(folder.iterdir())), "largest_mb": cost.largest_mb}
 
 
 def _against(true: Mapping[str, FloatArray], maps: Sequence[Any]) -> dict[str, float]:
