@@ -63,12 +63,10 @@ class AlbumFact:
     Attributes:
         name: path within the album. photo_id: the site's number.
         kind: survey, street, drone, other_town, copy, indoor, portrait, ...; the worlds' modules list theirs.
-        owner, licence: as in the table.
-        time: of capture as claimed, timezone-aware.
+        owner, licence: as in the table. time: of capture as claimed, timezone-aware.
         home: it shows the town whose frame the truth is in, so that it has a true pose.
-        copy_of: the original, "" where this is one.
+        copy_of: the original, "" where this is one. batch: the step in which it arrives.
         visit: photos of one visit by one person share it; -1 for those of none.
-        batch: when it arrives, for worlds that arrive in steps.
     """
 
     name: str
@@ -118,10 +116,7 @@ def town_of(options: TownOptions, *, away: bool = False) -> Scene:
 
 
 def day_key(town: str, day: int, hour: float) -> str:
-    """Key of the scene of a town on a day (0 to 729) at an hour; sorts by what is dear to paint.
-
-    Days of a week share their parked cars.
-    """
+    """Key of the scene of a town on a day (0 to 729) at an hour; days of a week share their parked cars."""
     light = 1 if hour < 11 else 2 if hour < 15 else 3
     return f"{town}/{light}/{day // 7:03d}"
 
@@ -147,13 +142,9 @@ class PlannedPhoto:
 
     Attributes:
         shot: camera, pose, time, name within the album's folder. Its gps_enu is not used.
-        scene: key of the scene that it shows.
-        fact: what is true of it.
-        geotag: what it claims, or None.
+        scene: key of the scene that it shows. fact: what is true of it. geotag: what it claims.
         exif: full, no_gps (the position is in the table only), or none.
-        subject: what it shows.
-        edits: what was done to it afterwards.
-        quality: of the JPEG.
+        edits: what was done to it afterwards. quality: of the JPEG.
         sensor: of its camera, as this person uses it.
         orientation: EXIF orientation, 6 or 8 for a phone held upright that stores landscape pictures.
     """

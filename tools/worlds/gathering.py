@@ -93,9 +93,7 @@ def _view(
     if not inside.all() or not around.free(look.eye):
         return None
     pose = look_at(around.scene, look.eye, look.target, look.turn_deg)
-    if not around.worth_taking(device.camera, pose, nearest_m):
-        return None
-    return device, pose, orientation
+    return (device, pose, orientation) if around.worth_taking(device.camera, pose, nearest_m) else None
 
 
 class _Flight:
@@ -123,8 +121,8 @@ class _Flight:
         height = self._at(self._target, above)[2]
         looks = []
         for i in range(self._count):
-            eye = self._target + radius * _ahead(start + step * i) + rng.normal(0, 0.8, 3)
-            looks.append(Viewpoint(eye=np.array([*eye[:2], height]), target=self._target))
+            x, y, _ = self._target + radius * _ahead(start + step * i) + rng.normal(0, 0.8, 3)
+            looks.append(Viewpoint(eye=np.array([x, y, height]), target=self._target))
         return looks
 
     def climb(self) -> list[Viewpoint]:
@@ -276,15 +274,11 @@ def tagged(
 ) -> list[PlannedPhoto]:
     """The photos with their geotags."""
     by_name = {p.name: p for p in people}
-    asked = [
-        Tagging(
-            center=p.shot.cam_from_local.center,
-            visit=p.fact.visit,
-            tagged=bool(rng.random() < by_name[p.fact.owner].tags),
-            by_hand=by_name[p.fact.owner].by_hand,
-        )
-        for p in photos
-    ]
+    asked = []
+    for p in photos:
+        owner, center = by_name[p.fact.owner], p.shot.cam_from_local.center
+        has_tag = bool(rng.random() < owner.tags)
+        asked.append(Tagging(center=center, visit=p.fact.visit, tagged=has_tag, by_hand=owner.by_hand))
     given = give_geotags(scene, asked, options, rng)
     return [replace(p, geotag=tag) for p, tag in zip(photos, given, strict=True)]
 

@@ -25,20 +25,16 @@ class Person:
     """A contributor.
 
     Attributes:
-        name, licence: attribution.
-        drone, ground: cameras, None where there is none.
-        drone_share: of the photos taken by drone, of who has both.
+        drone, ground: cameras. drone_share: of the photos taken by drone, of who has both.
         weight: how many photos, relative to the others.
         heights_m: of most drone photos over the ground.
         skill: 0 to 1; careless people tilt the camera, stand anywhere and blur their photos.
         upright: ground photos held upright: never, stored as landscape with an EXIF orientation, or
             stored upright.
         zoom: largest factor on the focal length of the ground camera.
-        exif: what is left of it.
-        tags: share of photos with a geotag.
+        exif: what is left of it. tags: share of photos with a geotag.
         by_hand: geotags are set on the site's map, without height.
-        quality: of the JPEG.
-        edits: on every photo. crop_share: of the photos that are cropped as well.
+        edits: on every photo. crop_share: of the photos that are cropped as well. quality: of the JPEG.
     """
 
     name: str

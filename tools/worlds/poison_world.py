@@ -56,8 +56,7 @@ class PoisonOptions(TownOptions):
 
     Attributes:
         honest, late: photos of honest people before and after the poison. canaries: held-out photos.
-        per_poison: photos of each of POISONS.
-        sights: places that honest people visit.
+        per_poison: photos of each of POISONS. sights: places that honest people visit.
     """
 
     seed: int = 4
@@ -310,11 +309,8 @@ def _rows(crowns: Ellipsoids, rows: NDArray[np.bool_]) -> Ellipsoids:
 
 
 def _moved(faces: Faces, sign: float, start: float) -> Faces:
-    """The faces of which x becomes sign x + start.
-
-    A mirrored face has its edges exchanged, so that its outside stays outside; the texture is printed
-    the wrong way round.
-    """
+    """The faces of which x becomes sign x + start; mirrored ones with their edges exchanged, so that the
+    outside stays outside, and the texture printed the wrong way round."""
     flip = np.array([sign, 1.0, 1.0])
     moved = replace(
         faces, origin=faces.origin * flip + [start, 0.0, 0.0], object_id=faces.object_id + _ID_SHIFT

@@ -22,8 +22,7 @@ class Sight:
     """Something that people photograph, in town axes, metres.
 
     Attributes:
-        target: what they aim at. radius: half its size.
-        weight: popularity.
+        target: what they aim at. radius: half its size. weight: popularity.
         stands: eye positions from which it is seen from the ground.
     """
 
@@ -173,11 +172,8 @@ def _stands(
 def look_at(
     scene: Scene, eye: FloatArray, target: FloatArray, turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> Rigid3:
-    """Pose of a camera at `eye` that looks at `target`, both (3,) in town axes.
-
-    Args:
-        turn_deg: added to heading, pitch, roll.
-    """
+    """Pose of a camera at `eye` that looks at `target`, both (3,) in town axes; `turn_deg` is added to
+    heading, pitch, roll."""
     position = scene.enu_from_town @ eye
     view = scene.enu_from_town @ (np.asarray(target, dtype=np.float64) - eye)
     heading = float(np.degrees(np.arctan2(view[0], view[1])))
