@@ -34,9 +34,8 @@ class Target:
 
     Attributes:
         config: Zenoh configuration of his own certificate, of the client `name`.
-        port, gateway: ports of the server and of its gateway, on this machine.
+        port, gateway: ports of the server and of its gateway, on this machine. pid: of the server.
         database: its name on the wire. photo: that it localises. map_ids: that it answers from.
-        pid: of the server, on this machine.
     """
 
     config: Path

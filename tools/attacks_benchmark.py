@@ -1,7 +1,5 @@
 """What honest clients notice while others attack: answer times, failures and the server's memory.
 
-    python -m tools.attacks_benchmark DB PHOTOS
-
 DB has one real map of the PHOTOS, and is made larger by copies of it to 200,000 points. A real server process
 with keys (TLS, rules) and a gateway serve it. Three honest clients ask photos with and without a prior, one
 of them newly connected each time, quiet and under each attack of tools/attacks.py. A failed question counts

@@ -1,7 +1,5 @@
 """Windows of an ortho image registered to an airborne scan as nadir telephoto photos, from intensity alone.
 
-    python -m tools.autzen_windows SCAN.laz ORTHO.tif [--photos FOLDER ...] [--seed 0] [--figure FILE.png]
-
 The scan is added to a database as any other; its colours are thrown away, for they may come from that ortho
 image. Scan and image are laid on one grid, whose pixels are no finer than either. Each window of 400 x 400
 pixels becomes the photo of a camera 1000 m above the ground, whose prior is wrong by 20 m in a random

@@ -1,7 +1,5 @@
 """A folder of films by strangers: maps of what shows the place, placed by one frame, every frame tracked.
 
-    python -m tools.community_films --work DIR [--seed N]
-
 1. Six simulated films without telemetry: three of one place (cuts, a title, black, a zoom, a logo, bars), one
    of another town, two of the place that are compressed badly, one of which shows the other town in between.
    They are drawn once and kept.
@@ -88,8 +86,7 @@ def main() -> None:
 
 
 def track_figures(tracks: Mapping[str, Trajectory], truth: FilmsTruth) -> dict[str, float]:
-    """Of tracks by film: frames that show the place, those tracked and inside their bounds, their errors; and
-    poses of frames that do not show it."""
+    """Of tracks by film: frames of the place, tracked and inside their bounds; their errors; other poses."""
     frames = foreign = 0
     metres, squares = [], []
     for film, trajectory in tracks.items():
@@ -144,15 +141,10 @@ def _of_place(keyframes: Sequence[MapKeyframe]) -> bool:
 
 def _explained(films: Sequence[Mapping[str, Any]], name: str, span_s: tuple[float, float]) -> bool:
     """Whether the report says why there is no keyframe of a span of a film: of the film, or of a shot."""
-    for film in films:
-        if Path(film["path"]).name == name:
-            if film["status"] == "refused" and film["reason"]:
-                return True
-            for shot in film["shots"]:
-                beside = shot["end_s"] <= span_s[0] or span_s[1] <= shot["start_s"]
-                if not beside and not shot["keyframes"] and shot["dropped"]:
-                    return True
-    return False
+    mine = [film for film in films if Path(film["path"]).name == name]
+    shots = [s for film in mine for s in film["shots"] if s["start_s"] < span_s[1] and span_s[0] < s["end_s"]]
+    refused = any(film["status"] == "refused" and film["reason"] for film in mine)
+    return refused or any(not shot["keyframes"] and shot["dropped"] for shot in shots)
 
 
 def keyframe_to_pick_in(keyframes: Sequence[MapKeyframe], stills: Path) -> tuple[Path, Seen]:

@@ -1,7 +1,5 @@
 """A film without positions, found within 250 m on a scan that has intensities alone: how often, how right?
 
-    python -m tools.film_near --work DIR [--inputs FOLDER]
-
 The film `smooth` of `tools.track_evaluation`, without its telemetry, becomes a map without a place. Each draw
 names a point 100 m from the middle of the town's scan in a random direction, and `featuredb anchor --near`
 places a copy of the map; then the same on the scan of another town, where nothing may be placed. A placed
@@ -17,7 +15,7 @@ from featuredb.store import Database
 from tools.commands import anchor, largest_map, newest_copy, once, with_scan
 from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
 from tools.paper import frame_of, stills_of, unplaced_film
-from tools.track_evaluation import smooth_film
+from tools.track_evaluation import FRAMES, drawn_film
 from tools.unplaced_brighton import all_drawn, near_words
 from tools.worlds.film_world import FilmTruth
 from tools.worlds.scan_world import make_scan_world
@@ -29,7 +27,7 @@ def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
     inputs, work = args.inputs, args.work
     world = make_scan_world(inputs)
-    film, truth = smooth_film(inputs)
+    film, truth = drawn_film("smooth", FRAMES, inputs)
     made = once(work / "db", partial(unplaced_film, film))
     figures: dict[str, float] = {"draws": _DRAWS}
     for kind, scan in (("here", world.scan), ("elsewhere", world.other_scan)):

@@ -1,7 +1,5 @@
 """A film becomes a map, and is followed by it: against its own telemetry, or without positions by itself.
 
-    python -m tools.film_tracked FILM.mp4 --work FOLDER [--no-telemetry]
-
 `featuredb ingest video`, then the film is tracked by the largest map as `featuredb track` does. With
 telemetry the map has a place, and the track is compared with that. The receiver's own noise is part of these
 distances; the radius is that of the track: of the horizontal ellipse that holds 95 %, at the median frame.

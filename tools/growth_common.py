@@ -44,11 +44,7 @@ _UNSAID_M = 30.0  # accuracy of a geotag that names none
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Album:
-    """An album on disk.
-
-    Attributes:
-        folder: of the photos. truth, facts: by name. rows: of the table, by name.
-    """
+    """An album on disk: the folder of its photos; truth, facts and rows of the table by their names."""
 
     folder: Path
     truth: Truth
@@ -106,17 +102,19 @@ def world_told(doc: str | None, argv: Sequence[str] | None, world: type[W]) -> t
     return args, world(seed=args.seed)
 
 
-def made(plan: Callable[[W], list[PlannedPhoto]], folder: Path, options: W) -> Album:
-    """The album of these options in `folder`, made or finished unless it is complete."""
+def surveyed(work: Path, options: W, plan: Callable[[W], list[PlannedPhoto]]) -> tuple[Album, Database]:
+    """The album of these options, made or finished unless it is complete, and a database of its survey."""
+    folder = work / "world"
 
     def progress(done: int, total: int) -> None:
         if done % 100 == 0 or done == total:
-            say(f"{folder.name}: {done} of {total} photos")
+            say(f"{done} of {total} photos")
 
     write_album(folder, options, partial(plan, options), progress=progress)
     lines = (folder / TABLE_FILE).read_text(encoding="utf-8").splitlines()
     rows = {row["path"]: row for row in map(json.loads, lines)}
-    return Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
+    album = Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
+    return album, anchored(work / "db", album, "survey")
 
 
 def anchored(path: Path, album: Album, survey: str) -> Database:

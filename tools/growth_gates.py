@@ -43,13 +43,10 @@ TruePlace = Callable[[str], FloatArray | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """One question to all gates of a step.
+    """One question to all gates of a step: "place", "refine", "budget" or "trust".
 
     Attributes:
-        step: "place", "refine", "budget" or "trust".
-        key: of the photos, sorted.
-        right, wrong: photos as they would lie.
-        gates: by name, whether it passes.
+        key: of the photos, sorted. right, wrong: photos as they would lie. gates: whether each passes.
     """
 
     step: str

@@ -1,7 +1,5 @@
 """Poison: look-alike blocks, mirrors, liars and forgers send photos. Is anything wrong promoted?
 
-    python -m tools.growth_poison --work DIR [--seed N]
-
 The world is that of `tools.worlds.poison_world`. The survey is ingested, honest photos are grown, and
 held-out photos become canaries with their true poses. Then a copy of that database gets all kinds of poison
 together, grows, gets honest photos that come later, and grows again. Whatever is active then is compared with
@@ -15,8 +13,6 @@ the truth:
 Then wrong maps are forced in by hand: every quarantined map with poison, and, so that there is always one, an
 honest grown map moved by 3 m under a new id. Answers to the canaries and to honest photos are compared,
 before, while it is in service, and after `retire`: bit for bit, but for the number of the snapshot.
-
-Exit code 0 if nothing wrong was promoted and every answer came back.
 """
 
 import json
@@ -43,14 +39,13 @@ from tools.commands import newest_copy
 from tools.growth_common import (
     Album,
     Verdict,
-    anchored,
     answer_of,
     conclude,
     give,
     grown,
-    made,
     none_failed,
     registered,
+    surveyed,
     world_told,
 )
 from tools.worlds.poison_world import POISONS, PoisonOptions, poison_album
@@ -83,8 +78,8 @@ class PoisonOutcome:
 
 def main(argv: Sequence[str] | None = None) -> int:
     args, world = world_told(__doc__, argv, PoisonOptions)
-    album = made(poison_album, args.work / "world", world)
-    base = honest_base(args.work / "db", album)
+    album, base = surveyed(args.work, world, poison_album)
+    grow_honest(base, album)
     clean = max(off_shares(base, album, world).values(), default=0.0)
     outcome = try_poison(args.work, base, album, world)
     forced = Database.open(newest_copy(args.work / "db", args.work / "db-forced"))
@@ -92,11 +87,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return conclude(args.json, judge(outcome, clean, fabricated))
 
 
-def honest_base(path: Path, album: Album) -> Database:
-    """The database before any poison: survey, honest photos, canaries."""
-    database = anchored(path, album, "survey")
+def grow_honest(database: Database, album: Album) -> None:
+    """Honest photos and canaries, before any poison."""
     if any(m.method == "map" for m in database.snapshot().maps()):
-        return database
+        return
     for fact in album.of("canary"):
         true = album.truth.images[fact.name]
         grid = album.truth.frame.grid_from_enu(true.cam_from_local.center, album.truth.epsg)
@@ -110,8 +104,7 @@ def honest_base(path: Path, album: Album) -> Database:
         )
         add_canary(database, fact.photo_id, (album.folder / fact.name).read_bytes(), pose, origin="person")
     give(database, album, album.of("honest"))
-    grown(database, path.parent, album)
-    return database
+    grown(database, Path(database.url).parent, album)
 
 
 def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) -> PoisonOutcome:

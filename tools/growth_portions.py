@@ -1,7 +1,5 @@
 """Real photos in three portions: a first map, the others added by growth, compared with all at once.
 
-    python -m tools.growth_portions --photos FOLDER --cut interleaved --work WORK
-
 1. Joint: all photos are reconstructed at once. The largest reconstruction is the reference.
 2. Portions: the photos, sorted by name, are cut into three, by turns (interleaved) or one after the other
    (consecutive). The first reconstruction of at least five photos is placed by GPS,
@@ -60,11 +58,9 @@ class State:
 
     Attributes:
         photos: all of the set. waiting: rows that are in no map yet.
-        poses: of registered photos in the first map's frame, by name.
-        frame: of the first map.
+        poses: of registered photos in `frame`, which is the first map's, by name.
         growth: without a drift budget where the first map's metre is made up.
-        joint: the joint reconstruction.
-        gates: where what the gates say is recorded, beside the joint reconstruction's places.
+        joint: the joint reconstruction. gates: where what the gates say is recorded, beside its places.
     """
 
     photos: list[Photo]

@@ -1,7 +1,5 @@
 """One landmark by many people, a third of whom say where they were: placed as well as that allows?
 
-    python -m tools.landmark_tags --photos FOLDER --work DIR [--json FILE]
-
 1. The photos, without positions, become a map. It is the truth, with the building's front 137 m wide.
 2. A third of its photos get geotags that are off by 8 m, in a table that says nothing of accuracy. The table
    is ingested by `featuredb ingest photos --trust-geotags`.

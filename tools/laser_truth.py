@@ -1,7 +1,5 @@
 """Maps and answers against laser truth (Strecha's sets), beside plain COLMAP that is given the true lens.
 
-    python -m tools.laser_truth FOLDER [--json FILE]
-
 Of the folder (see `tools.laser_set`) all photos but every fifth from the third on are ingested into a new
 database, with exact positions and the EXIF of one camera whose focal length is rounded to a whole
 millimetre of 35 mm film. The other photos are asked of a server twice: with their true camera, and with EXIF

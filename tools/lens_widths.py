@@ -1,7 +1,5 @@
 """How wide are real lenses around what is known of them beforehand? Measures the widths of the lens priors.
 
-    python -m tools.lens_widths --photos FOLDER [FOLDER ...] --work DIR [--json FILE]
-
 Each folder of photos is ingested into a database of its own in DIR (one that is there is used). Of every lens
 of its maps the photos' own say is taken from the adjustment: its normal equations with poses and points
 eliminated, less the prior. The widths are those under which the lenses of all cameras together are most
@@ -28,7 +26,6 @@ from featuredb.geometry.camera import Camera
 from ingest.colmap.adjust import AdjustOptions
 from ingest.colmap.map_errors import terms_of_map
 from ingest.colmap.picture_shear import picture_shear
-from ingest.photos.photo import Photo
 from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
 from tools.commands import all_maps, largest_map, make, once
@@ -66,25 +63,16 @@ def main() -> None:
     parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
     args = parser.parse_args()
     options = AdjustOptions()
-    databases = [_database(folder, args.work) for folder in args.photos]
-    told = [
-        one
-        for database, folder in zip(databases, args.photos, strict=True)
-        for one in lenses_of(database, folder, options)
-    ]
-    write_shears(databases)
-    if not told:
-        raise SystemExit("no lens of any map")
+    databases = {folder: _database(folder, args.work) for folder in args.photos}
+    told = [one for folder, database in databases.items() for one in lenses_of(database, folder, options)]
+    write_shears(list(databases.values()))
     assumed = assumed_widths(options)
     measured = measured_widths(told, assumed, options)
-    limits = {name: limits_of(told, measured, k, options) for k, name in enumerate(WIDTHS)}
-    figures = {
-        "lenses": len(told),
-        **dict(zip(WIDTHS, measured, strict=True)),
-        "inside": sum(limits[name][0] <= assumed[k] <= limits[name][1] for k, name in enumerate(WIDTHS)),
-        "assumed": dict(zip(WIDTHS, assumed, strict=True)),
-        "limits": limits,
-    }
+    limits = [limits_of(told, measured, k, options) for k in range(len(WIDTHS))]
+    figures: dict[str, float] = {"lenses": len(told), "inside": 0}
+    for name, width, wanted, (low, high) in zip(WIDTHS, measured, assumed, limits, strict=True):
+        say(f"{name}: {width:.2g}, between {low:.2g} and {high:.2g}; assumed {wanted:.2g}")
+        figures |= {name: width, "inside": figures["inside"] + (low <= wanted <= high)}
     write_figures(args.json, figures)
 
 
@@ -101,11 +89,11 @@ def write_shears(databases: Sequence[Path]) -> None:
 
 def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> list[Told]:
     """What the photos of each lens of a database's maps say of it."""
-    photos = {photo.name: photo for photo in scan_folder(folder).photos}
+    focal_of = {photo.name: photo.focal_px for photo in scan_folder(folder).photos}
     told: list[Told] = []
     for feature_map in all_maps(database):
         block = whole_lens(block_of_map(feature_map))
-        focal_px = _focals(block.names, block.camera_of.tolist(), photos)
+        focal_px = _focals(block.names, block.camera_of.tolist(), focal_of)
         terms = terms_of_map(block, focal_px, None, options)
         problem = Problem(block, terms, options.threads)
         problem.solve(options.max_iterations, 1e-6)
@@ -185,13 +173,14 @@ def limits_of(
     return float(best[which] * np.exp(ends[0])), float(best[which] * np.exp(ends[1]))
 
 
-def _focals(names: Sequence[str], camera_of: Sequence[int], photos: Mapping[str, Photo]) -> dict[int, float]:
+def _focals(
+    names: Sequence[str], camera_of: Sequence[int], focal_of: Mapping[str, float | None]
+) -> dict[int, float]:
     """EXIF's focal length of each camera whose photos tell one."""
     told: dict[int, set[float | None]] = {}
     for name, camera in zip(names, camera_of, strict=True):
-        told.setdefault(camera, set()).add(photos[name].focal_px)
-    only = {camera: next(iter(focals)) for camera, focals in told.items() if len(focals) == 1}
-    return {camera: focal for camera, focal in only.items() if focal is not None}
+        told.setdefault(camera, set()).add(focal_of[name])
+    return {camera: min(focals) for camera, focals in told.items() if len(focals) == 1 and None not in focals}
 
 
 def _database(folder: Path, work: Path) -> Path:

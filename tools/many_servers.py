@@ -1,7 +1,5 @@
 """What several servers of one database behind a router carry, and what becomes of queries when one is killed.
 
-    python -m tools.many_servers [--json FILE]
-
 Each server is a process whose only worker takes 100 ms for a photo and does nothing else. Clients ask without
 pause: one server, two, four; then two of which one is killed (SIGKILL) in the middle.
 """

@@ -1,7 +1,5 @@
 """The paper's film beside ours (Bodensteiner et al., sections 3.1.2 and 3.2).
 
-    python -m tools.paper --work DIR [--inputs FOLDER]
-
 A simulated film without any telemetry becomes a map; six picks in one frame place it on an intensity-only
 scan; all frames are tracked. The paper measures distances from a bundle adjustment; here from the truth,
 which no adjustment's own error softens, and beside it from the map's adjusted keyframes.
@@ -23,7 +21,7 @@ from reloc.tracking.track_video import TrackedVideo, track_video
 from tools.commands import featuredb, largest_map, make
 from tools.figures import kept, study_parser, write_figures
 from tools.picked import Seen, place_by_picks, read_scan
-from tools.track_evaluation import judge_film, smooth_film
+from tools.track_evaluation import FRAMES, drawn_film, judge_film
 from tools.worlds.film_world import FilmTruth
 from tools.worlds.scan_world import make_scan_world
 
@@ -38,7 +36,7 @@ def main() -> None:
 def film_figures(work: Path, inputs: Path) -> dict[str, Any]:
     """A film that says nothing of its place, placed by one frame, tracked from end to end."""
     world = make_scan_world(inputs)
-    film, truth = smooth_film(inputs)
+    film, truth = drawn_film("smooth", FRAMES, inputs)
     # Who starts again goes on from there.
     made = kept(work / "placed.json", lambda: placed_film(film, world.scan, truth, work))
     if not made["placed"]:

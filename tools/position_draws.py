@@ -1,7 +1,5 @@
 """Are placements by positions of any quality as uncertain as they say, and can chance place a map?
 
-    python -m tools.position_draws --work DIR [--photos FOLDER ...] [--draws 25] [--json FILE]
-
 Flights are the largest maps of the folders, made by an ordinary ingest, and five simulated ones; where a
 flight's cameras are then is the truth. Positions are made from it in the ways below, and the flight is placed
 by them as if they came from a plain receiver (4 m and 10 m). Printed by kind: how many flights have a place,
@@ -163,10 +161,8 @@ def squares(placed: GpsPlacement, camera: FloatArray) -> dict[str, float]:
 
 
 def unrelated(flights: Sequence[Flight], chance: int) -> dict[str, float]:
-    """Positions that have nothing to do with the photos: how many flights would answer.
-
-    `chance` draws of random positions, each flight's own in another order, and those of each other flight.
-    """
+    """How many flights would answer with `chance` draws of random positions, with their own in another order,
+    and with those of each other flight."""
     found: dict[str, list[GpsPlacement]] = {"random": [], "shuffled": [], "other": []}
     for draw in range(chance):
         rng = np.random.default_rng((_SEED, 99, draw))

@@ -1,7 +1,5 @@
 """What a large database costs: its start, a small commit, a query; beside a small one of the same maps.
 
-    python -m tools.scale_benchmark DB:FOLDER [DB:FOLDER ...] --work FOLDER [--points N] [--json FILE]
-
 Each DB holds one map of the photos in FOLDER. Some of its photos are taken out of the map and asked for.
 Copies of the maps are laid out as one city until they have N described points. A copy has its map's shape at
 another place, and its descriptors with their cells in another order: real ones, which are neither the map's

@@ -107,10 +107,8 @@ def copied_map(source: FeatureMap, frame: LocalFrame, number: int, map_id: str) 
 
 
 def cell_order(copy: int) -> NDArray[np.int64]:
-    """(128,) another order of a descriptor's 4 x 4 cells; the first is its own.
-
-    Corners, edges and inner cells change places among themselves: they have different weights in SIFT.
-    """
+    """(128,) another order of a descriptor's 4 x 4 cells, the first its own; corners, edges and inner cells,
+    of different weights in SIFT, change places among themselves."""
     rng = np.random.default_rng(copy)
     cells = np.arange(16)
     inner = sum((at % 3 > 0).astype(np.int64) for at in np.divmod(cells, 4))
@@ -141,11 +139,7 @@ def free_port() -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """A server with keys, and a gateway before it.
-
-    Attributes:
-        keys: folder of the authority. port: of the proxy before the server.
-    """
+    """A server with keys, and a gateway before it; the authority's folder, and the port of the proxy."""
 
     server: ServeProcess
     gateway: CommandProcess
@@ -180,8 +174,7 @@ class Heard:
 
     Attributes:
         seconds: of each question, failed ones as long as they may take. failures: codes.
-        same: of each answer, whether it is the place of the first one to the same question, or none where
-            that had none.
+        same: of each answer, whether it is that of the first one to the same question.
     """
 
     seconds: list[float] = field(default_factory=list)

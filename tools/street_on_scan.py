@@ -1,7 +1,5 @@
 """Maps of street photos placed on the scan of their town by its outlines: how many, how right?
 
-    python -m tools.street_on_scan --work DIR [--inputs DIR]
-
 Of each town, 60 photos by ten people, a third of them with geotags of 10 m (`tools.worlds.community`),
 are ingested, and each map of ten photos and more is placed by `featuredb anchor --near --auto` on the town's
 scan, what that leaves as a map without a place likewise; then the same on the scan of another town, where

@@ -1,7 +1,5 @@
 """Single strips of photos, placed by positions with the cameras' angles and without: are the bounds true?
 
-    python -m tools.strip_draws --photos FOLDER --scan SCAN.laz --poses POSES.json [--draws 200] [--json FILE]
-
 Real strips are runs of five or six photos along one line of the folder, with the positions and angles of
 their EXIF and XMP; the truth is POSES.json (tools/scan_poses.py, from a scan alone). Simulated ones have
 noise of 0.3 to 2 m, as much bias as a plain receiver, and angles as wrong as those of `brighton`: in one

@@ -1,7 +1,5 @@
 """How right tracked films are: flights over the simulated town, anchored on its scan, against true poses.
 
-    python -m tools.track_evaluation --work DIR [--films smooth jerky cut]
-
 1. The world of `tools.worlds.scan_world`: `featuredb ingest photos` maps the drone's photos,
    `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
 2. Films of the same town at 1280x720 and 30 Hz: smooth; jerky, with gusts and turns on the spot; cut, which
@@ -51,13 +49,14 @@ from tools.worlds.scan_world import make_scan_world
 _FILMS = ("smooth", "jerky", "cut")
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
 _END = 200  # frames at each end whose errors are compared; of short films, a half each
-_FRAMES, _SEED = 1200, 1
+FRAMES, _SEED = 1200, 1
+_WORLD = WorldOptions.short(_SEED)
 _CUT = (0.4, 0.55)  # of the film
 
 
 def main() -> None:
     parser = study_parser(__doc__, "--work", "--inputs")
-    parser.add_argument("--frames", type=int, default=_FRAMES)
+    parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
@@ -67,15 +66,12 @@ def main() -> None:
         raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
     results: dict[str, dict[str, float]] = {}
     for name in args.films:
-        options = film_options(name, args.frames)
-        film = write_film(args.inputs / f"film-{name}-{args.frames}-{_SEED}", options) / FILM_FILE
-        truth = film_truth(options)
-        finder = finder_on(args.on, database, truth)
-        tracked = track_video(film, finder, camera=truth.camera)
+        film, truth = drawn_film(name, args.frames, args.inputs)
+        tracked = track_video(film, finder_on(args.on, database, truth), camera=truth.camera)
         results[name] = judge_film(tracked, truth)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
         if args.draw:
-            scene, track = town_of(options.world), tracked.trajectory
+            scene, track = town_of(_WORLD), tracked.trajectory
             results[f"{name}_layer"] = drawn_marks(args.work, film, truth, scene, track, database)
     write_figures(args.json, results)
 
@@ -95,14 +91,13 @@ def film_options(name: str, frames: int) -> FilmOptions:
     style: FlightStyle = "jerky" if name == "jerky" else "smooth"
     path = PathOptions(seed=_SEED, style=style, half_extent_m=(32.0, 26.0))
     cut = (round(_CUT[0] * frames), round(_CUT[1] * frames)) if name == "cut" else None
-    return FilmOptions(world=WorldOptions.short(_SEED), path=path, frames=frames, cut=cut)
+    return FilmOptions(world=_WORLD, path=path, frames=frames, cut=cut)
 
 
-def smooth_film(inputs: Path) -> tuple[Path, FilmTruth]:
-    """The film `smooth` of 1,200 frames, with its telemetry beside it, and its truth; drawn once."""
-    options = film_options("smooth", _FRAMES)
-    folder = write_film(inputs / f"film-smooth-{_FRAMES}-{_SEED}", options)
-    return folder / FILM_FILE, film_truth(options)
+def drawn_film(name: str, frames: int, inputs: Path) -> tuple[Path, FilmTruth]:
+    """A film, with its telemetry beside it, and its truth; drawn once."""
+    options = film_options(name, frames)
+    return write_film(inputs / f"film-{name}-{frames}-{_SEED}", options) / FILM_FILE, film_truth(options)
 
 
 def axis_errors(
