@@ -211,8 +211,13 @@ def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, header), header.size)
 
 
-def conclude(path: Path | None, verdicts: Sequence[Verdict]) -> int:
-    """Print what was measured, and write it to a path; 0 if everything holds."""
+def conclude(path: Path | None, verdicts: Sequence[Verdict], lost: int) -> int:
+    """Print what was measured, and write it to a path; 0 if everything holds.
+
+    Args:
+        lost: photos that a step lost by an exception that it did not foresee, not by a reason.
+    """
+    verdicts = [*verdicts, Verdict("no step failed", f"{lost} photos lost by an exception", lost == 0)]
     failed = [v.name for v in verdicts if not v.holds]
     say(f"does not hold: {', '.join(failed) or 'nothing'}")
     summary = "; ".join(f"{v.name}: {v.text}" for v in verdicts)
@@ -232,8 +237,3 @@ def grown(database: Database, out: Path, album: Album, gates: str = "gates") -> 
     for line in report.as_text().splitlines():
         say(line[:300])
     return Counter(p.reason_code for p in report.photos if p.reason_code)
-
-
-def none_failed(count: int) -> Verdict:
-    """Of photos that a step lost by an exception that it did not foresee, not by a reason."""
-    return Verdict("no step failed", f"{count} photos lost by an exception", count == 0)

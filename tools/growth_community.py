@@ -17,7 +17,6 @@ from tools.growth_common import (
     conclude,
     give,
     grown,
-    none_failed,
     registered,
     surveyed,
     world_told,
@@ -34,8 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     album, database = surveyed(args.work, world, community_album)
     give(database, album, album.of(*_OWN, *_FOREIGN, "copy"))
     waiting = grown(database, args.work, album)
-    verdicts = [*judge(album, registered(database, album)), none_failed(waiting["FAILED"])]
-    return conclude(args.json, verdicts)
+    return conclude(args.json, judge(album, registered(database, album)), waiting["FAILED"])
 
 
 def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:

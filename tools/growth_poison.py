@@ -43,7 +43,6 @@ from tools.growth_common import (
     conclude,
     give,
     grown,
-    none_failed,
     registered,
     surveyed,
     world_told,
@@ -60,11 +59,9 @@ class PoisonOutcome:
     """What the poison did.
 
     Attributes:
-        sent: photos. active: of them, in such maps. wrong: photos registered wrongly in active
-            maps by their kind, the poison's and honest ones alike.
+        sent: photos. active: of them, in such maps. wrong: photos of any kind that active maps have wrongly.
         off_share: largest share of points off the true surface among active grown maps with poison.
-        forced: maps that were forced in. restored: whether all answers came back.
-        failed: photos lost by an exception.
+        forced: maps that were forced in. restored: whether all answers came back. failed: lost photos.
     """
 
     sent: int
@@ -84,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     outcome = try_poison(args.work, base, album, world)
     forced = Database.open(newest_copy(args.work / "db", args.work / "db-forced"))
     fabricated = force_and_retire(forced, album, [moved_copy(forced)])
-    return conclude(args.json, judge(outcome, clean, fabricated))
+    return conclude(args.json, judge(outcome, clean, fabricated), outcome.failed)
 
 
 def grow_honest(database: Database, album: Album) -> None:
@@ -223,7 +220,6 @@ def judge(o: PoisonOutcome, clean: float, fabricated: dict[str, Any]) -> list[Ve
             f"{'came back' if fabricated['restored'] else 'DID NOT COME BACK'}",
             o.restored and fabricated["restored"] and fabricated["changed"],
         ),
-        none_failed(o.failed),
     ]
 
 
