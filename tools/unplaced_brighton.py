@@ -8,8 +8,7 @@
 
 With --near each draw names a point 100 m from the middle of the scan in a random direction, and
 `featuredb anchor --near` places the copy within 250 m: ten draws on the scan with its colours, ten on one
-whose intensities are its grey values. Then ten on a mirrored scan, which is no place on Earth: nothing may be
-placed.
+whose intensities are its grey values, and ten on a mirrored scan, which is no place on Earth.
 
 A draw is placed, refused, or wrong: placed with the held-out photos a metre off or not answered. A run that
 was stopped goes on in --work.
@@ -29,14 +28,13 @@ from featuredb.store.scans import list_scans
 from tools.commands import anchor, make, newest_copy, with_scan
 from tools.figures import kept, spread, write_figures
 from tools.photo_files import copied, photo_names
-from tools.picked import picks, read_scan, write_picks
+from tools.picked import Seen, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
 from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
 HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
 _WRONG_M = 1.0
 _DRAWS, _NEAR_DRAWS, _SEED = 20, 10, 1
-_SIGMA_PX = 3.0  # of a pick, each axis
 _KINDS = ("colour", "intensity", "mirrored")
 _AWAY_M, _RADIUS_M = 100.0, 250.0
 _GREY = np.array([0.299, 0.587, 0.114])
@@ -59,8 +57,8 @@ def by_picks(args: argparse.Namespace, truth: ScanTruth) -> dict[str, float]:
     def draw(number: int) -> dict[str, float] | None:
         rng = np.random.default_rng((_SEED, number))
         image = str(rng.choice(names))
-        drawn = picks(scan, truth.cameras[image], truth.poses[image], rng, _SIGMA_PX)
-        file = write_picks(work / f"picks-{number}.csv", image, *drawn)
+        seen = Seen(image=image, camera=truth.cameras[image], cam_from_local=truth.poses[image])
+        file = write_picks(work / f"picks-{number}.csv", scan, seen, rng)
         return placed_by(made, work, truth, "--picks", str(file), "--image", image)
 
     return {"draws": _DRAWS, **summed(all_drawn("draw", _DRAWS, draw, work), _DRAWS)}
