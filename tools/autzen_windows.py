@@ -14,18 +14,15 @@ window counts as having structure by these measures alone:
 - of its parts of 25 x 25 pixels on the ground, at least a quarter have an edge in the ortho image and in the
   scan: a gradient (sigma 2 pixels) whose 95th percentile there is above the picture's own 75th percentile.
 
-Ortho image and scan disagree. By how much is measured before anything is registered, where the ground shows:
-the oriented gradients of patches of the image are correlated with the scan's, the maps are summed, and draws
-of the patches with replacement say how sure the peak is. A window's error is the root mean square, over 16
-places of the window, of the distance on the ground between where the pose puts them and where the ortho image
-and the offset of its half do.
+Ortho image and scan disagree, by an offset that is measured in each half before anything is registered
+(`measured_offset`). A window's error is the root mean square, over 16 places of the window, of the distance
+on the ground between where the pose puts them and where the ortho image and the offset of its half do.
 
 No window lies in both the western and the eastern half. For each half the program prints what the product
 accepts, and the limit of evidence that would be chosen there (the lowest with which nothing wrong and nothing
 of another place is accepted) with what it gives in the other half.
 
-Refused must be: mirrored windows, windows whose prior lies elsewhere in the scan, photos of other places; at
-least 44 in all.
+Refused must be: mirrored windows, windows whose prior lies elsewhere in the scan, photos of other places.
 """
 
 import tempfile
@@ -37,7 +34,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -228,7 +224,6 @@ def _ground_error(place: OrthoOverScan, camera: Camera, pose: Rigid3, trial: _Tr
 def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
     """Evidence of the pictures against the error on the ground, with the verdict's two lines."""
     chart = Figure(figsize=(7.5, 3.6), dpi=110, facecolor="white", layout="constrained")
-    FigureCanvasAgg(chart)
     axes = chart.subplots()
     looks = {"window": ("o", "#2e7d32"), "mirrored": ("x", "#c62828"), "elsewhere": ("+", "#ad1457")}
     for kind in _KINDS:

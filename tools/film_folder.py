@@ -34,7 +34,7 @@ class Script:
     """A film.
 
     Attributes:
-        name: of its file, without suffix. town: seed of the place.
+        name: of its file, without suffix.
         pieces: what stands between cuts, in its order; a flight that is cut away from end to end shows
             another town.
         logo: burnt into a corner. bars: share of the height that is black above, and below.

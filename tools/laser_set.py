@@ -140,6 +140,7 @@ def colmap_given_the_lens(truth: LaserSet) -> tuple[dict[str, Rigid3], dict[str,
         model = max(found.values(), key=lambda one: one.num_reg_images())
         images = [model.image(i) for i in model.reg_image_ids()]
         poses = {one.name: Rigid3.from_matrix(one.cam_from_world().matrix()) for one in images}
+        move = robust_similarity(centers(list(poses.values())), centers([truth.poses[n] for n in poses]))
         known, asked = _described_points(model, database), {}
         with pycolmap.Database.open(str(_extracted(truth, truth.asked, work / "asked.db"))) as read:
             for image in read.read_all_images():
@@ -147,7 +148,6 @@ def colmap_given_the_lens(truth: LaserSet) -> tuple[dict[str, Rigid3], dict[str,
                 pose = _localised(pixels, read.read_descriptors(image.image_id).data, known, truth.camera)
                 if pose is not None:
                     asked[image.name] = pose
-    move = robust_similarity(centers(list(poses.values())), centers([truth.poses[name] for name in poses]))
     mapped, answered = ({n: move.act_on_pose(pose) for n, pose in of.items()} for of in (poses, asked))
     return mapped, answered
 

@@ -102,14 +102,13 @@ def lens_error(maps: Sequence[FeatureMap], truth: LaserSet) -> float:
 def map_errors(maps: Sequence[FeatureMap], truth: LaserSet) -> Errors:
     """Of the cameras of placed maps, as they lie."""
     poses: dict[str, Rigid3] = {}
-    told_m, told_deg = [], []
+    stated: list[FloatArray] = []
     for one in maps:
         area = build_area([one])
         poses |= poses_in(FRAME, one)
-        for image in one.images:
-            covariance = stated_covariance(area, one, image)
-            told_m.append(error_radius(covariance[3:, 3:]))
-            told_deg.append(float(np.degrees(error_radius(covariance[:3, :3]))))
+        stated += [stated_covariance(area, one, image) for image in one.images]
+    told_m = [error_radius(covariance[3:, 3:]) for covariance in stated]
+    told_deg = [float(np.degrees(error_radius(covariance[:3, :3]))) for covariance in stated]
     return replace(errors_of(poses, truth), told_m=told_m, told_deg=told_deg, wanted=len(truth.mapped))
 
 
@@ -118,9 +117,8 @@ def stated_covariance(area: Area, feature_map: FeatureMap, image: MapImage) -> F
     pose = image.cam_from_local
     world_from_cam = np.kron(np.eye(2), pose.rotation.T)
     own = np.zeros((6, 6)) if image.covariance is None else image.covariance
-    return np.asarray(
-        world_from_cam @ own @ world_from_cam.T + placement_covariance(area, feature_map, pose.center)
-    )
+    placed = placement_covariance(area, feature_map, pose.center)
+    return np.asarray(world_from_cam @ own @ world_from_cam.T + placed)
 
 
 def camera_squares(

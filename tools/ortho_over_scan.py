@@ -130,7 +130,11 @@ def halves_of(place: OrthoOverScan) -> dict[str, Part]:
 
 
 def measured_offset(place: OrthoOverScan, part: Part) -> Offset:
-    """By how much the scan's intensities lie beside the ortho image in a part of the grid."""
+    """By how much the scan's intensities lie beside the ortho image's ground in a part of the grid.
+
+    Oriented gradients of patches of the image are correlated with the scan's, the maps are summed, and draws
+    of the patches with replacement say how sure the peak is.
+    """
     usable = (place.shown & ~place.high)[part]
     size, reach = int(_PATCH_M / place.cell), int(_REACH_M / place.cell)
     image, scan = (

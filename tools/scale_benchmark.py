@@ -164,8 +164,7 @@ def _started(path: Path, query: Query) -> tuple[Localiser, float]:
 
 
 def measure(path: Path, queries: Sequence[Query]) -> dict[str, float]:
-    """Of one database, in a process that has done nothing before: seconds, milliseconds of a query (median),
-    shares of queries, bytes after them."""
+    """Of one database, in a new process: seconds, milliseconds of a query (median), shares, then bytes."""
     localiser, start_s = _started(path, queries[0])
     points = sum(len(a.area.points) for a in localiser.areas)
     times: dict[bool, list[float]] = {True: [], False: []}

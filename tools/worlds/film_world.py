@@ -53,10 +53,8 @@ class PathOptions:
 
     Attributes:
         seed: of the way. style: smooth; or jerky: gusts, and turns on the spot of up to 95 degrees in 0.8 s.
-        duration_s: of the flight.
         half_extent_m: it stays within (+-x, +-y) of the town's middle, town axes.
-        heights_m: over the town's origin. speed_m_s: over ground.
-        down_deg: how far below the horizon it looks.
+        heights_m: over the town's origin. speed_m_s: over ground. down_deg: of its view, below the horizon.
         river: whether the way leads over the water and looks down on it.
     """
 
@@ -215,8 +213,7 @@ class FilmTruth:
 
     Attributes:
         camera: true intrinsics. frame, epsg: local frame of the poses, UTM zone of answers.
-        times_s: (n,) seconds.
-        cam_from_local: true poses; None where the frame does not show the town.
+        times_s: (n,) seconds. cam_from_local: true poses; None where the frame does not show the town.
     """
 
     camera: Camera
@@ -232,11 +229,8 @@ class FilmTruth:
 
 
 def write_film(folder: Path, options: FilmOptions, workers: int = 0) -> Path:
-    """Write film and telemetry into `folder`; a folder that holds just these is left as it is.
-
-    Args:
-        workers: processes; 0 takes one per core.
-    """
+    """Write film and telemetry into `folder`, by so many processes, 0 for one per core; a folder that holds
+    just these is left as it is."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / TELEMETRY_FILE).write_text(_telemetry(options), encoding="utf-8")
     tags = {"creation_time": _START.isoformat()}
