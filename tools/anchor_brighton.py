@@ -1,8 +1,5 @@
 """Photos and a scan end to end: a map placed by GPS is anchored on the scan; held-out photos judge it.
 
-    python -m tools.anchor_brighton --photos FOLDER --scan SCAN.laz --poses poses.json \\
-        --work FOLDER --held-out A.JPG ... [--pixels]
-
 1. `featuredb ingest photos` makes a map of all photos but the held-out ones.
 2. `featuredb lidar add` adds the scan; `featuredb anchor --auto` places the map by it.
 3. A server answers for each held-out photo, as `featuredb query` asks: nothing but the file.
@@ -72,18 +69,13 @@ def main() -> None:
 
 def stated(rows: Sequence[HeldOutRow]) -> dict[str, float]:
     """The radii that answers state (68 %), and over their errors; medians."""
-    told = [
-        (
-            row.position_68_m,
-            row.orientation_68_deg,
-            row.position_68_m / row.error.position_m,
-            row.orientation_68_deg / row.error.angle_deg,
-        )
-        for row in rows
-        if row.error is not None
-    ]
-    names = ("stated_m", "stated_deg", "stated_over_m", "stated_over_deg")
-    return dict(zip(names, np.median(told, axis=0).tolist(), strict=True)) if told else {}
+    found = [(row, row.error) for row in rows if row.error is not None]
+    return {
+        "stated_m": median([row.position_68_m for row, _ in found]),
+        "stated_deg": median([row.orientation_68_deg for row, _ in found]),
+        "stated_over_m": median([row.position_68_m / error.position_m for row, error in found]),
+        "stated_over_deg": median([row.orientation_68_deg / error.angle_deg for row, error in found]),
+    }
 
 
 def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
@@ -93,14 +85,12 @@ def by_gps(database: Database, truth: ScanTruth) -> dict[str, float]:
     focal_px, scan_px = feature_map.cameras[first.camera_id].focal_px, truth.cameras[first.name].focal_px
     own = {name: pose.center for name, pose in poses_in(truth.frame, feature_map).items()}
     shape = laid_apart(own, {name: truth.poses[name].center for name in own})
-    uncertainty = LensUncertainty.of_provenance(feature_map.provenance)
-    if uncertainty is None:
-        raise SystemExit("the map has no lens uncertainty")
+    sigma = LensUncertainty.of_provenance(feature_map.provenance).focal_rel
     return {
         "gps_focal_px": focal_px,
         "scan_focal_px": scan_px,
-        "gps_focal_sigma": uncertainty.focal_rel,
-        "gps_focal_off": abs(focal_px / scan_px - 1.0) / max(uncertainty.focal_rel, 0.01),
+        "gps_focal_sigma": sigma,
+        "gps_focal_off": abs(focal_px / scan_px - 1.0) / max(sigma, 0.01),
         "gps_shape_m": median(shape),
     }
 

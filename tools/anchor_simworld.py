@@ -1,13 +1,11 @@
 """The simulated world end to end: photos, scan, anchoring without a person, queries against the truth.
 
-    python -m tools.anchor_simworld --work DIR [--inputs DIR] [--pixels]
-
 1. `featuredb simworld --lidar` writes photos whose GPS has a drone's errors, an airborne scan with
    intensities only, an ortho image of another day, and the same of another town at the same place.
 2. `featuredb ingest photos` places the map by GPS; `featuredb lidar add` adds the scan.
 3. `featuredb anchor --auto` places the map on the scan of the other town, which it must refuse, and then on
    its own.
-4. The map's cameras and the held-out queries are compared with the truth, before and after.
+4. The map's cameras are compared with the truth, before and after; then the held-out queries.
 
 With --pixels, in place of the other town and of 4: each held-out photo is localised; pixels at random, of
 what stands still, are located on the scan. Bounds: poses and lenses are drawn around the truth as each
@@ -49,9 +47,9 @@ _STRIPS_M = 0.5 * AirborneScanOptions().strip_shift_m / np.sqrt(2.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Miss:
-    """How far a place is off: `error_m` (3,), and its square in units of the covariance."""
+    """How far a place is off, and the square of that in units of the covariance."""
 
-    error_m: FloatArray
+    off_m: float
     squared: float
     at_edge: bool
 
@@ -66,11 +64,9 @@ def main() -> None:
         write_figures(args.json, located(Database.open(database), world.world))
         return
     refused = anchored(work, world, other=True)[1]
-    figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
-    for name, path in (("gps", work / "mapped"), ("scan", database)):
-        found = judged(Database.open(path), world.world)
-        figures |= {f"{name}_{key}": value for key, value in found.items()}
-    write_figures(args.json, figures)
+    by_gps = camera_errors(first_map(Database.open(work / "mapped")), world.world.truth)[0]
+    figures = {"placed": int(placed), "other_placed": int(refused), "gps_cameras_m": float(np.median(by_gps))}
+    write_figures(args.json, figures | judged(Database.open(database), world.world))
 
 
 def anchored(work: Path, world: ScanWorld, *, other: bool) -> tuple[Path, bool]:
@@ -90,12 +86,12 @@ def judged(database: Database, world: World) -> dict[str, float]:
     poses = {image.name: image.cam_from_local for image in world.truth.group("queries")}
     answers = error_figures(ask_poses(database, world.folder, list(poses), world.truth.frame, poses))
     return {
-        "cameras_m": float(np.median(metres)),
-        "cameras_deg": float(np.median(degrees)),
-        "queries": answers["asked"],
-        "answered": answers["answered"],
-        "queries_m": answers["median_m"],
-        "queries_largest_m": answers["largest_m"],
+        "scan_cameras_m": float(np.median(metres)),
+        "scan_cameras_deg": float(np.median(degrees)),
+        "scan_queries": answers["asked"],
+        "scan_answered": answers["answered"],
+        "scan_queries_m": answers["median_m"],
+        "scan_queries_largest_m": answers["largest_m"],
     }
 
 
@@ -131,11 +127,8 @@ def located(database: Database, world: World) -> dict[str, float]:
 
 
 def _drawn(rng: np.random.Generator, view: AnsweredView, photo: TrueImage, here: Rigid3) -> AnsweredView:
-    """A pose and a lens that are off from the true ones as the answer's covariance says.
-
-    Args:
-        here: the frame of the answer from that of the truth.
-    """
+    """A pose and a lens that are off from the true ones as the answer's covariance says; `here`: the frame of
+    the answer from that of the truth."""
     error = rng.multivariate_normal(np.zeros(len(view.covariance)), view.covariance)
     local_from_cam = (photo.cam_from_local @ here.inverse()).inverse()
     turned = so3_exp(error[:3]).T @ local_from_cam.rotation
@@ -151,17 +144,16 @@ def misses(view: AnsweredView, places: FloatArray, found: Sequence[PixelPlace]) 
     """Misses of the pixels that have a place; `places`: (n, 3) true ones, in the frame of the view."""
     missed = []
     for place, true in zip(found, places, strict=True):
-        if place.utm is None or place.covariance is None:
-            continue
-        error = view.frame.enu_from_utm(place.utm, place.epsg) - true
-        square = squared(error, place.covariance)
-        missed.append(Miss(error_m=error, squared=square, at_edge=place.at_edge))
+        if place.utm is not None and place.covariance is not None:
+            error = view.frame.enu_from_utm(place.utm, place.epsg) - true
+            square = squared(error, place.covariance)
+            missed.append(Miss(off_m=float(np.linalg.norm(error)), squared=square, at_edge=place.at_edge))
     return missed
 
 
 def miss_figures(name: str, missed: Sequence[Miss]) -> dict[str, float]:
     """Errors in metres and shares inside the bounds, off edges and at them; `name` stands before each."""
-    far = np.array([np.linalg.norm(miss.error_m) for miss in missed])
+    far = np.array([miss.off_m for miss in missed])
     edge = np.array([miss.at_edge for miss in missed])
     squares = np.array([miss.squared for miss in missed])
     return {

@@ -34,15 +34,14 @@ class Target:
 
     Attributes:
         config: Zenoh configuration of his own certificate, of the client `name`.
-        port: of the server. gateway: host and port.
+        port, gateway: ports of the server and of its gateway, on this machine. pid: of the server.
         database: its name on the wire. photo: that it localises. map_ids: that it answers from.
-        pid: of the server, on this machine.
     """
 
     config: Path
     name: str
     port: int
-    gateway: tuple[str, int]
+    gateway: int
     database: str
     photo: bytes
     map_ids: Sequence[str]
@@ -86,12 +85,11 @@ def _scans(target: Target) -> None:
 
 
 def _truncated(target: Target) -> None:
-    photo = target.photo
-    _ask(target, itertools.cycle([(photo[: len(photo) * k // 20], None) for k in range(1, 20)]))
+    step = len(target.photo) // 20
+    _ask(target, itertools.cycle([(target.photo[: k * step], None) for k in range(1, 20)]))
 
 
 def _hostile(target: Target) -> None:
-    photo = target.photo
     attachments = [
         b"[" * 60_000,
         b'{"options": {"maps": [' + b'"a",' * 10_000 + b'"a"]}}',
@@ -101,7 +99,7 @@ def _hostile(target: Target) -> None:
         json.dumps({"options": {"inliers": True}, "request_id": "x" * 10_000}).encode(),
         bytes(60_000),
     ]
-    _ask(target, itertools.cycle([(photo, a) for a in attachments]))
+    _ask(target, itertools.cycle([(target.photo, a) for a in attachments]))
 
 
 def _parts(target: Target) -> None:
@@ -134,7 +132,7 @@ def _connections(target: Target) -> None:
     while True:
         held = [
             connected("127.0.0.1", port, STRANGER)
-            for port in (target.port, target.gateway[1])
+            for port in (target.port, target.gateway)
             for _ in range(_CONNECTIONS)
         ]
         for connection in held[::2]:
@@ -151,7 +149,7 @@ def _dripping(target: Target) -> None:
         b"Content-Length: 1000000\r\n\r\n"
     )
     while True:
-        held = [connected(*target.gateway) for _ in range(_CONNECTIONS)]
+        held = [connected("127.0.0.1", target.gateway) for _ in range(_CONNECTIONS)]
         for connection in held:
             _say(connection, head)
         for _ in range(20):
@@ -224,10 +222,8 @@ def png(width: int, height: int, pixels: bytes, *, bits: int = 8, colour: int = 
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
-    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
-    return b"".join(
-        [b"\x89PNG\r\n\x1a\n", chunk(b"IHDR", header), chunk(b"IDAT", pixels), chunk(b"IEND", b"")]
-    )
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
 
 
 def zeros(size: int) -> bytes:

@@ -1,7 +1,5 @@
 """What honest clients notice while others attack: answer times, failures and the server's memory.
 
-    python -m tools.attacks_benchmark DB PHOTOS
-
 DB has one real map of the PHOTOS, and is made larger by copies of it to 200,000 points. A real server process
 with keys (TLS, rules) and a gateway serve it. Three honest clients ask photos with and without a prior, one
 of them newly connected each time, quiet and under each attack of tools/attacks.py. A failed question counts
@@ -47,19 +45,15 @@ def main() -> None:
     args = service_parser(__doc__).parse_args()
     database = Database.open(args.db)
     map_ids = enlarged(database, _POINTS)
-    points = sum(m.points for m in database.snapshot().maps())
     photos = photos_of(args.photos, 6)
     measured: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory() as scratch, running_service(args.db, Path(scratch)) as service:
         expected = first_answers(service, photos)
-        localised = sum(reply.status == "localised" for reply in expected)
-        say(f"{points} points; {localised} of {len(expected)} questions localised")
-        host, port = service.gateway.endpoint.removeprefix("http://").rsplit(":", 1)
         target = Target(
             config=service.config(ATTACKER),
             name=ATTACKER,
             port=service.port,
-            gateway=(host, int(port)),
+            gateway=int(service.gateway.endpoint.rsplit(":", 1)[1]),
             database=wire_name_of(str(args.db)),
             photo=photos[0],
             map_ids=map_ids,
@@ -84,20 +78,21 @@ def main() -> None:
                 "after_mib": service.server.memory_mib(),
             }
             say(f"{name}: {measured[name]}")
+    points = sum(one.points for one in database.snapshot().maps())
     write_figures(args.json, figures(measured) | {"points": points})
 
 
 def figures(measured: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Those of the quiet server, and the worst of all attacks."""
-    quiet, killed, last = measured["quiet"], measured["workers killed"], list(measured.values())[-1]
+    *_, last = measured.values()
     others = [of for name, of in measured.items() if name not in ("quiet", "workers killed")]
     return {
-        "quiet_p99_s": quiet["p99_s"],
-        "quiet_mib": quiet["peak_mib"],
+        "quiet_p99_s": measured["quiet"]["p99_s"],
+        "quiet_mib": measured["quiet"]["peak_mib"],
         "worst_p99_s": max(of["p99_s"] for of in others),
         "worst_http_p99_s": max(of["http_p99_s"] for of in others),
         "failures": sum(of["failures"] for of in others),
-        "failures_by_kills": killed["failures"],
+        "failures_by_kills": measured["workers killed"]["failures"],
         "wrong": sum(of["wrong"] for of in measured.values()),
         "asked": sum(of["asked"] for of in measured.values()),
         "peak_mib": max(of["peak_mib"] for of in measured.values()),

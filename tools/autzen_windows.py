@@ -1,7 +1,5 @@
 """Windows of an ortho image registered to an airborne scan as nadir telephoto photos, from intensity alone.
 
-    python -m tools.autzen_windows SCAN.laz ORTHO.tif [--photos FOLDER ...] [--seed 0] [--figure FILE.png]
-
 The scan is added to a database as any other; its colours are thrown away, for they may come from that ortho
 image. Scan and image are laid on one grid, whose pixels are no finer than either. Each window of 400 x 400
 pixels becomes the photo of a camera 1000 m above the ground, whose prior is wrong by 20 m in a random
@@ -14,32 +12,28 @@ window counts as having structure by these measures alone:
 
 - at most half of it is higher than 3 m above the ground around, and
 - of its parts of 25 x 25 pixels on the ground, at least a quarter have an edge in the ortho image and in the
-scan:
-  a gradient (sigma 2 pixels) whose 95th percentile in the part is above the picture's own 75th percentile.
+  scan: a gradient (sigma 2 pixels) whose 95th percentile there is above the picture's own 75th percentile.
 
-Ortho image and scan disagree. By how much is measured before anything is registered, where the ground shows:
-the oriented gradients of patches of the image are correlated with the scan's, the maps are summed, and draws
-of the patches with replacement say how sure the peak is. A window's error is the root mean square, over 16
-places of the window, of the distance on the ground between where the pose puts them and where the ortho image
-and the offset of its half do.
+Ortho image and scan disagree, by an offset that is measured in each half before anything is registered
+(`measured_offset`). A window's error is the root mean square, over 16 places of the window, of the distance
+on the ground between where the pose puts them and where the ortho image and the offset of its half do.
 
 No window lies in both the western and the eastern half. For each half the program prints what the product
 accepts, and the limit of evidence that would be chosen there (the lowest with which nothing wrong and nothing
 of another place is accepted) with what it gives in the other half.
 
-Refused must be: mirrored windows, windows whose prior lies elsewhere in the scan, photos of other places; at
-least 44 in all.
+Refused must be: mirrored windows, windows whose prior lies elsewhere in the scan, photos of other places.
 """
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import cycle, zip_longest
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -53,7 +47,7 @@ from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import SURE_CONFIRMATION_LOG_NFA
 from tools.commands import cloud_of
-from tools.figures import off_pose, prior_off_by, study_parser, write_figures
+from tools.figures import off_pose, prior_off_by, say, study_parser, write_figures
 from tools.ortho_over_scan import (
     Floats,
     OrthoOverScan,
@@ -63,6 +57,7 @@ from tools.ortho_over_scan import (
     measured_offset,
     place_of,
 )
+from tools.photo_files import photo_names
 
 _STEP_PX = 200  # between windows, at most
 _MOST = 24  # windows of a half
@@ -75,8 +70,7 @@ _KINDS = ("window", "mirrored", "elsewhere", "photo")
 _LIMIT_M, _WRONG_M = 2.0, 5.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Trial:
+class _Trial(NamedTuple):
     """A picture, and the window at which it is looked for."""
 
     kind: str
@@ -92,13 +86,10 @@ class WindowOutcome:
 
     kind: str
     half: str
-    column: int
-    row: int
     has_structure: bool
     accepted: bool
     error_m: float | None
     log_nfa: float
-    message: str
 
     @property
     def close(self) -> bool:
@@ -121,19 +112,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         cloud = replace(cloud_of(args.scan, Path(folder) / "db"), rgb=None)
         (scan,) = list_scans(Database.open(Path(folder) / "db"))
-    print(f"scan: {len(cloud):,} points, {scan.height_datum} heights, EPSG:{scan.epsg}")
     place = place_of(args.ortho, scan.epsg, cloud)
-    print(f"grid: {place.gray.shape[1]} x {place.gray.shape[0]} pixels of {place.cell:.4f} m")
     halves = halves_of(place)
     offsets = {name: measured_offset(place, part) for name, part in halves.items()}
-    everywhere = measured_offset(place, (slice(None), slice(None)))
-    for name, offset in {"everywhere": everywhere, **offsets}.items():
-        print(f"offset, {name}: {offset}", flush=True)
     outcomes = []
     for number, trial in enumerate(_trials(place, halves, args.photos)):
         rng = np.random.default_rng([args.seed, number])
         outcomes.append(_one(place, cloud, trial, offsets[trial.half].metres, rng))
-        print(outcomes[-1], flush=True)
+        say(f"column {trial.column}, row {trial.row}: {asdict(outcomes[-1])}")
     if args.figure is not None:
         _draw(outcomes, args.figure)
     sigma = {f"{name}_offset_sigma_m": float(np.linalg.norm(of.sigma)) for name, of in offsets.items()}
@@ -149,7 +135,7 @@ def _trials(place: OrthoOverScan, halves: Mapping[str, Part], folders: Sequence[
         return place.gray[r : r + place.window, c : c + place.window]
 
     for half, c, r in both:
-        yield _Trial(kind="window", half=half, column=c, row=r, photo=cut(c, r))
+        yield _Trial("window", half, c, r, cut(c, r))
     photos = _foreign(folders)
     for path, (half, c, r) in zip(photos, cycle(both), strict=False):
         gray = decode_gray(path)
@@ -157,17 +143,16 @@ def _trials(place: OrthoOverScan, halves: Mapping[str, Part], folders: Sequence[
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         y, x = (gray.shape[0] - place.window) // 2, (gray.shape[1] - place.window) // 2
         photo = np.ascontiguousarray(gray[y : y + place.window, x : x + place.window])
-        yield _Trial(kind="photo", half=half, column=c, row=r, photo=photo)
+        yield _Trial("photo", half, c, r, photo)
     # Those with structure first: they have something to agree by chance.
     both.sort(key=lambda spot: not has_structure(place, *spot[1:]))
     for number, (half, c, r) in zip(range(_OTHERS - len(photos)), cycle(both), strict=False):
         far = max(both, key=lambda spot: np.hypot(spot[1] - c, spot[2] - r))
         if number % 2 and np.hypot(far[1] - c, far[2] - r) * place.cell > _FAR_M:
             # The prior out of the search's reach.
-            yield _Trial(kind="elsewhere", half=far[0], column=far[1], row=far[2], photo=cut(c, r))
+            yield _Trial("elsewhere", *far, cut(c, r))
         else:
-            mirrored = np.ascontiguousarray(cut(c, r)[:, ::-1])
-            yield _Trial(kind="mirrored", half=half, column=c, row=r, photo=mirrored)
+            yield _Trial("mirrored", half, c, r, np.ascontiguousarray(cut(c, r)[:, ::-1]))
 
 
 def _spots(place: OrthoOverScan, part: Part) -> list[tuple[int, int]]:
@@ -191,8 +176,8 @@ def _foreign(folders: Sequence[Path]) -> list[Path]:
     """A few photos of each folder, spread over it."""
     found = []
     for folder in folders:
-        photos = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg"))
-        found += photos[:: max(1, len(photos) // _EACH)][:_EACH]
+        names = photo_names(folder)
+        found += [folder / name for name in names[:: max(1, len(names) // _EACH)][:_EACH]]
     return found
 
 
@@ -209,13 +194,10 @@ def _one(
     return WindowOutcome(
         kind=trial.kind,
         half=trial.half,
-        column=trial.column,
-        row=trial.row,
         has_structure=has_structure(place, trial.column, trial.row),
         accepted=found.accepted,
         error_m=error,
         log_nfa=found.evidence.get("confirmation", {}).get("log_nfa", 0.0),
-        message=f"{found.reason}: {found.message}" if found.reason else "",
     )
 
 
@@ -224,9 +206,8 @@ def _nadir_camera(place: OrthoOverScan, trial: _Trial) -> tuple[Camera, Rigid3]:
     window = (slice(trial.row, trial.row + place.window), slice(trial.column, trial.column + place.window))
     middle = place.on_ground(np.array([[trial.column, trial.row]]) + place.window / 2)[0]
     center = np.array([*middle, float(np.median(place.ground[window])) + _HEIGHT_M])
-    rotation = np.diag([1.0, -1.0, -1.0])
     camera = Camera.from_focal(place.window, place.window, _HEIGHT_M / place.cell, "SIMPLE_PINHOLE")
-    return camera, Rigid3(rotation=rotation, translation=-rotation @ center)
+    return camera, Rigid3.from_center(np.diag([1.0, -1.0, -1.0]), center)
 
 
 def _ground_error(place: OrthoOverScan, camera: Camera, pose: Rigid3, trial: _Trial, offset: Floats) -> float:
@@ -243,7 +224,6 @@ def _ground_error(place: OrthoOverScan, camera: Camera, pose: Rigid3, trial: _Tr
 def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
     """Evidence of the pictures against the error on the ground, with the verdict's two lines."""
     chart = Figure(figsize=(7.5, 3.6), dpi=110, facecolor="white", layout="constrained")
-    FigureCanvasAgg(chart)
     axes = chart.subplots()
     looks = {"window": ("o", "#2e7d32"), "mirrored": ("x", "#c62828"), "elsewhere": ("+", "#ad1457")}
     for kind in _KINDS:

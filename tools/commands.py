@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.lidar.add import add_scan
@@ -16,6 +16,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
+from tools.serve_process import watched_memory
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -41,12 +42,7 @@ def featuredb(*words: str, refusals: Sequence[int] = ()) -> subprocess.Completed
 def anchor(
     database: Path, map_id: str, photos: Path, out: Path, *start: str, refusals: Sequence[int] = (1,)
 ) -> bool:
-    """Whether `featuredb anchor` places a map without a person.
-
-    Args:
-        photos: folder of the map's photos. out: for its report.
-        start: arguments that say where to start.
-    """
+    """Whether `featuredb anchor` places a map without a person; `start`: arguments that say where from."""
     words = ("anchor", str(database), map_id, "--photos", str(photos), *start)
     return featuredb(*words, "--out", str(out), "--auto", "--quiet", refusals=refusals).returncode == 0
 
@@ -117,19 +113,27 @@ def first_map(database: Database) -> FeatureMap:
     return snapshot.load_map(snapshot.maps()[0].map_id)
 
 
-def processor_s(*argv: str) -> tuple[float, float, str]:
-    """Processor seconds of a Python process and all that it started, megabytes of the largest, its output.
+class Cost(NamedTuple):
+    """Processor seconds of a process and all that it started, megabytes of the largest of them, mebibytes of
+    all together at the most (what they share counts once), and the output."""
 
-    Raises SystemExit: it fails.
-    """
+    seconds: float
+    largest_mb: float
+    tree_mib: float
+    told: str
+
+
+def cost_of(*argv: str, sample_s: float = 1.0) -> Cost:
+    """Run Python with these arguments; memory is looked at so often. Raises SystemExit: it fails."""
     process = subprocess.Popen([sys.executable, *argv], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    told = process.stdout.read()
-    _, status, used = os.wait4(process.pid, 0)
+    with watched_memory(process.pid, sample_s) as seen:
+        told = process.stdout.read()
+        _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"exit code {process.returncode}: {' '.join(argv[:4])}")
-    return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, told
+    return Cost(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, max(seen), told)
 
 
 def cloud_of(

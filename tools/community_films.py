@@ -1,7 +1,5 @@
 """A folder of films by strangers: maps of what shows the place, placed by one frame, every frame tracked.
 
-    python -m tools.community_films --work DIR [--seed N]
-
 1. Six simulated films without telemetry: three of one place (cuts, a title, black, a zoom, a logo, bars), one
    of another town, two of the place that are compressed badly, one of which shows the other town in between.
    They are drawn once and kept.
@@ -88,20 +86,18 @@ def main() -> None:
 
 
 def track_figures(tracks: Mapping[str, Trajectory], truth: FilmsTruth) -> dict[str, float]:
-    """Of tracks by film: frames that show the place, those tracked and inside their bounds, their errors; and
-    poses of frames that do not show it."""
+    """Of tracks by film: frames of the place, tracked and inside their bounds; their errors; other poses."""
     frames = foreign = 0
     metres, squares = [], []
     for film, trajectory in tracks.items():
         poses = [one.pose for one in truth.films[film]]
         frames += sum(pose is not None for pose in poses)
         off = axis_errors(trajectory, truth.frame, poses)
-        for point, error in zip(trajectory.points, off, strict=True):
-            if point.pose is not None and np.isfinite(error).all():
-                metres.append(np.linalg.norm(error[3:]))
-                squares.append(squared(error, point.pose.covariance))
-            elif point.pose is not None:
-                foreign += 1
+        found = [(p.pose, e) for p, e in zip(trajectory.points, off, strict=True) if p.pose is not None]
+        shown = [(pose, error) for pose, error in found if np.isfinite(error).all()]
+        foreign += len(found) - len(shown)
+        metres += [np.linalg.norm(error[3:]) for _, error in shown]
+        squares += [squared(error, pose.covariance) for pose, error in shown]
     share = len(metres) / max(frames, 1)
     return {
         "place_frames": frames,
@@ -119,11 +115,8 @@ def map_figures(
     truth: FilmsTruth,
     scripts: Sequence[Script],
 ) -> dict[str, int]:
-    """Shots of the place, of which most keyframes are in maps of it; what is in them beside; losses.
-
-    Args:
-        maps: keyframes by map. told: the report of the ingest.
-    """
+    """Shots of the place, of which most keyframes are in maps of it (`maps`: keyframes by map); what is in
+    them beside; losses, by the report of the ingest."""
     shots = {(f"{s.name}.mp4", n): span for s in scripts for n, span in s.shots_s().items()}
     mapped = {k.image for keyframes in maps.values() for k in keyframes}
     left = [_keyframe(p["name"], truth, p["reason"]) for p in told["photos"] if p["name"] not in mapped]
@@ -148,15 +141,10 @@ def _of_place(keyframes: Sequence[MapKeyframe]) -> bool:
 
 def _explained(films: Sequence[Mapping[str, Any]], name: str, span_s: tuple[float, float]) -> bool:
     """Whether the report says why there is no keyframe of a span of a film: of the film, or of a shot."""
-    for film in films:
-        if Path(film["path"]).name == name:
-            if film["status"] == "refused" and film["reason"]:
-                return True
-            for shot in film["shots"]:
-                beside = shot["end_s"] <= span_s[0] or span_s[1] <= shot["start_s"]
-                if not beside and not shot["keyframes"] and shot["dropped"]:
-                    return True
-    return False
+    mine = [film for film in films if Path(film["path"]).name == name]
+    shots = [s for film in mine for s in film["shots"] if s["start_s"] < span_s[1] and span_s[0] < s["end_s"]]
+    refused = any(film["status"] == "refused" and film["reason"] for film in mine)
+    return refused or any(not shot["keyframes"] and shot["dropped"] for shot in shots)
 
 
 def keyframe_to_pick_in(keyframes: Sequence[MapKeyframe], stills: Path) -> tuple[Path, Seen]:

@@ -35,7 +35,7 @@ def drawn_marks(
     distances between a mark's centre and the pixel where its place belongs.
     """
     places = _places(scene, truth)
-    where = [[lon, lat, height] for lat, lon, height in truth.frame.geodetic_from_enu(places).tolist()]
+    where = truth.frame.geodetic_from_enu(places)[:, [1, 0, 2]].tolist()
     layer = {"type": "Feature", "properties": {}, "geometry": {"type": "MultiPoint", "coordinates": where}}
     (folder / "layer.geojson").write_text(json.dumps(layer))
     write_trajectory(folder / "track.csv", track)
@@ -44,20 +44,17 @@ def drawn_marks(
     words = ("draw", str(film), str(folder / "layer.geojson"), "--database", str(database))
     more = ("--track", str(folder / "track.csv"), "--camera", camera, "--out", str(folder / "drawn.mp4"))
     featuredb(*words, *more)
-    off: list[float] = []
-    frames = stray = 0
+    found: list[tuple[list[float], int]] = []
     with open_video(str(film)) as plain, open_video(str(folder / "drawn.mp4")) as drawn:
         for before, after in zip(plain, drawn, strict=True):
-            pose = truth.cam_from_local[before.index]
-            if pose is None:
-                continue
-            changed = np.abs(after.rgb().astype(np.int16) - before.rgb()).max(axis=2)
-            found, strange = marks_of(changed.astype(np.float64), lens.project(pose.act(places)))
-            off, frames, stray = [*off, *found], frames + bool(found), stray + strange
+            if (pose := truth.cam_from_local[before.index]) is not None:
+                changed = np.abs(after.rgb().astype(np.int16) - before.rgb()).max(axis=2)
+                found.append(marks_of(changed.astype(np.float64), lens.project(pose.act(places))))
+    off = [pixels for marks, _ in found for pixels in marks]
     return {
-        "frames": frames,
+        "frames": sum(bool(marks) for marks, _ in found),
         "marks": len(off),
-        "stray": stray,
+        "stray": sum(stray for _, stray in found),
         "median_px": float(np.median(off)),
         "largest_px": max(off),
     }
@@ -67,8 +64,7 @@ def marks_of(changed: FloatArray, pixels: FloatArray) -> tuple[list[float], int]
     """How far marks are from their places, pixels, and how many spots of the picture are no place's.
 
     Args:
-        changed: (h, w) by how much each pixel was changed, grey levels.
-        pixels: (n, 2) where places belong; NaN where the camera does not see them.
+        changed: (h, w) grey levels. pixels: (n, 2) where places belong; NaN of those that are not seen.
     """
     size = np.array(changed.shape[::-1])
     weight = np.where(changed > _CHANGED, changed, 0.0)
@@ -84,11 +80,9 @@ def marks_of(changed: FloatArray, pixels: FloatArray) -> tuple[list[float], int]
         corner = pixel.astype(int) - _REACH_PX
         if (apart < _APART_PX).sum() > 1 or (corner < 0).any() or (corner + 2 * _REACH_PX >= size).any():
             continue
-        around = (slice(corner[1], None), slice(corner[0], None))
-        mark = weight[around][: 2 * _REACH_PX + 1, : 2 * _REACH_PX + 1]
-        if (mark > 0).sum() < _FEWEST_PIXELS:
-            continue  # hidden
-        off.append(float(np.linalg.norm(corner + _ring_centre(mark) - pixel)))
+        mark = weight[corner[1] :, corner[0] :][: 2 * _REACH_PX + 1, : 2 * _REACH_PX + 1]
+        if (mark > 0).sum() >= _FEWEST_PIXELS:  # it is not hidden
+            off.append(float(np.linalg.norm(corner + _ring_centre(mark) - pixel)))
     return off, stray
 
 

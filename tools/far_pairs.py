@@ -1,7 +1,5 @@
 """Which verified pairs an ingest leaves out because their photos are too far apart by their positions.
 
-    python -m tools.far_pairs FOLDER [FOLDER ...] --work FOLDER [--json FILE]
-
 Photos are matched as `featuredb ingest photos --max-features 3000` does (`ingest/sfm/far_pairs.py`). Nobody
 knows which pairs of real photos are right: what is left out is counted, and its largest number of matches.
 `tools.bulk_ingest` does the same for a simulated flight, whose truth says it.
@@ -62,8 +60,7 @@ def against_truth(
     """Right and wrong pairs, and how many of each are left out: as positions are, and with some of them off.
 
     Args:
-        centers: (n, 2) true places of the photos on the ground plan.
-        apart_m: photos that are farther apart have nothing in common.
+        centers: (n, 2) true places on the ground plan; what is farther apart than `apart_m` shares nothing.
     """
     wrong = {p for p in inliers if float(np.linalg.norm(centers[p[0]] - centers[p[1]])) > apart_m}
     figures: dict[str, float] = {"pairs": len(inliers), "wrong_pairs": len(wrong)}
@@ -80,11 +77,11 @@ def _some_off(photos: Sequence[Photo], share: float) -> list[Photo]:
     moved = []
     for photo in photos:
         off, way = rng.random() < share, rng.normal(0.0, _OFF_M / _METRES_A_DEGREE, 2)
-        gps = photo.gps
-        if off and gps is not None:
+        if off and (gps := photo.gps) is not None:
             longitude = gps.longitude_deg + way[0] / np.cos(np.radians(gps.latitude_deg))
             gps = replace(gps, latitude_deg=gps.latitude_deg + way[1], longitude_deg=float(longitude))
-        moved.append(replace(photo, gps=gps))
+            photo = replace(photo, gps=gps)
+        moved.append(photo)
     return moved
 
 

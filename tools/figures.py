@@ -65,8 +65,7 @@ def pose_offset(pose: Rigid3, true: Rigid3) -> FloatArray:
 def off_pose(pose: Rigid3, rng: np.random.Generator, off_m: float, off_deg: float) -> Rigid3:
     """A pose that is wrong by so much, to some side and about some axis."""
     way, axis = (value / np.linalg.norm(value) for value in rng.normal(size=(2, 3)))
-    rotation = so3_exp(np.radians(off_deg) * axis) @ pose.rotation
-    return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + off_m * way))
+    return Rigid3.from_center(so3_exp(np.radians(off_deg) * axis) @ pose.rotation, pose.center + off_m * way)
 
 
 def prior_off_by(pose: Rigid3, off_m: float, off_deg: float) -> FramePrior:

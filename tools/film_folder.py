@@ -14,7 +14,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.writer import VideoWriterOptions
-from tools.worlds.film_world import Exposure, FilmOptions, PathOptions, film_frame, film_truth, write_frames
+from tools.worlds.film_world import FilmOptions, PathOptions, film_frame, film_truth, write_frames
 
 WIDTH, HEIGHT, RATE_HZ = 960, 540, 25.0
 _GOOD_CRF, _BAD_CRF, _WORSE_CRF = 20, 34, 37
@@ -34,7 +34,7 @@ class Script:
     """A film.
 
     Attributes:
-        name: of its file, without suffix. town: seed of the place.
+        name: of its file, without suffix.
         pieces: what stands between cuts, in its order; a flight that is cut away from end to end shows
             another town.
         logo: burnt into a corner. bars: share of the height that is black above, and below.
@@ -89,7 +89,7 @@ def six_films(seed: int) -> tuple[Script, ...]:
             rate_hz=RATE_HZ,
             width=WIDTH,
             height=HEIGHT,
-            exposure=Exposure(samples=1),
+            samples=1,
             ev_range=0.0,
             focal=focal,
             zoom=zoom,
@@ -100,10 +100,8 @@ def six_films(seed: int) -> tuple[Script, ...]:
         return replace(film, cut=(0, film.frames))
 
     black = Card(15)
-    tour = (
-        Card(30, "THE OLD TOWN"),
-        *(flight(42.0, 50.0, 5.6, 0.757), black, flight(48.0, 60.0, 5.6, 0.757)),
-    )
+    old = Card(30, "THE OLD TOWN")
+    tour = (old, flight(42.0, 50.0, 5.6, 0.757), black, flight(48.0, 60.0, 5.6, 0.757))
     low = (flight(32.0, 40.0, 6.4, 0.62, speed=5.0), flight(38.0, 46.0, 5.0, 0.62, speed=5.0))
     abroad = (Card(30, "FAR AWAY"), elsewhere(8.8, 0.7))
     best = (flight(44.0, 54.0, 5.6, 0.9), elsewhere(4.0, 0.9), flight(50.0, 60.0, 5.6, 0.9))
@@ -119,12 +117,8 @@ def six_films(seed: int) -> tuple[Script, ...]:
 
 
 class FrameTruth(NamedTuple):
-    """A frame of a film.
-
-    Attributes:
-        piece: what it belongs to. camera: true intrinsics; None where no camera saw it.
-        pose: cam_from_local; None where it does not show the place.
-    """
+    """A frame of a film: the piece that it belongs to, true intrinsics (None where no camera saw it), and
+    cam_from_local (None where it does not show the place)."""
 
     piece: int
     camera: Camera | None = None
@@ -165,7 +159,7 @@ def film_picture(script: Script, frame: int) -> Image8:
     piece = script.pieces[number]
     if isinstance(piece, Card):
         return _card(piece.text)
-    picture = film_frame(replace(piece, exposure=replace(piece.exposure, ev=script.ev)), at)
+    picture = film_frame(replace(piece, ev=script.ev), at)
     bar = round(script.bars * HEIGHT)
     if bar:
         picture[:bar] = picture[-bar:] = 0

@@ -1,7 +1,5 @@
 """A film without positions, found within 250 m on a scan that has intensities alone: how often, how right?
 
-    python -m tools.film_near --work DIR [--inputs FOLDER]
-
 The film `smooth` of `tools.track_evaluation`, without its telemetry, becomes a map without a place. Each draw
 names a point 100 m from the middle of the town's scan in a random direction, and `featuredb anchor --near`
 places a copy of the map; then the same on the scan of another town, where nothing may be placed. A placed
@@ -14,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.store import Database
-from tools.commands import anchor, newest_copy, once, with_scan
+from tools.commands import anchor, largest_map, newest_copy, once, with_scan
 from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
 from tools.paper import frame_of, stills_of, unplaced_film
-from tools.track_evaluation import smooth_film
+from tools.track_evaluation import FRAMES, drawn_film
 from tools.unplaced_brighton import all_drawn, near_words
 from tools.worlds.film_world import FilmTruth
 from tools.worlds.scan_world import make_scan_world
@@ -29,7 +27,7 @@ def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
     inputs, work = args.inputs, args.work
     world = make_scan_world(inputs)
-    film, truth = smooth_film(inputs)
+    film, truth = drawn_film("smooth", FRAMES, inputs)
     made = once(work / "db", partial(unplaced_film, film))
     figures: dict[str, float] = {"draws": _DRAWS}
     for kind, scan in (("here", world.scan), ("elsewhere", world.other_scan)):
@@ -45,14 +43,11 @@ def main() -> None:
 
 def _draw(number: int, made: Path, work: Path, truth: FilmTruth) -> dict[str, float] | None:
     database = newest_copy(made, work / "placed")
-    biggest = max(Database.open(database).snapshot().unplaced_maps(), key=lambda one: one.images)
-    near = near_words(database, number)
-    if not anchor(database, biggest.map_id, stills_of(made), work / "anchor", near, refusals=(1, 2)):
+    map_id, near = largest_map(database).map_id, near_words(database, number)
+    if not anchor(database, map_id, stills_of(made), work / "anchor", near, refusals=(1, 2)):
         return None
-    feature_map = Database.open(database).snapshot().load_map(biggest.map_id)
-    poses = {image.name: truth.cam_from_local[frame_of(image.name)] for image in feature_map.images}
-    true = {name: pose for name, pose in poses.items() if pose is not None}
-    off = pose_errors(poses_in(truth.frame, feature_map), true)[0]
+    poses = poses_in(truth.frame, Database.open(database).snapshot().load_map(map_id))
+    off = pose_errors(poses, {name: truth.cam_from_local[frame_of(name)] for name in poses})[0]
     return {"median_m": float(np.median(off)), "largest_m": float(off.max())}
 
 

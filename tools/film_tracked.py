@@ -1,7 +1,5 @@
 """A film becomes a map, and is followed by it: against its own telemetry, or without positions by itself.
 
-    python -m tools.film_tracked FILM.mp4 --work FOLDER [--no-telemetry]
-
 `featuredb ingest video`, then the film is tracked by the largest map as `featuredb track` does. With
 telemetry the map has a place, and the track is compared with that. The receiver's own noise is part of these
 distances; the radius is that of the track: of the horizontal ellipse that holds 95 %, at the median frame.
@@ -42,6 +40,7 @@ def main() -> None:
     finder = finder_for(Database.open(database), FilmGround(maps=(made.map_id,)), None, TrackOptions())
     points = track_video(args.film, finder).trajectory.points
     keyframes = len(list((database / "_work" / "films").rglob("*.jpg")))
+    tracked = sum(point.found for point in points)
     against = against_keyframes(made, points) if args.no_telemetry else against_telemetry(args.film, points)
     figures = {
         "keyframes": keyframes,
@@ -49,21 +48,21 @@ def main() -> None:
         "mapped_share": len(made.images) / keyframes,
         "active": int(not args.no_telemetry and made.status == "active"),
         "frames": len(points),
-        "tracked": sum(point.found for point in points),
-        "tracked_share": sum(point.found for point in points) / len(points),
+        "tracked": tracked,
+        "tracked_share": tracked / len(points),
     }
     write_figures(args.json, figures | against)
 
 
 def against_telemetry(film: Path, points: Sequence[TrajectoryPoint]) -> dict[str, float]:
     """Frames that have a position in the telemetry, too, and the horizontal distances."""
-    found = [(point, point.pose) for point in points if point.pose is not None]
-    at = telemetry_of_video(film).at([point.time_s for point, _ in found])
+    found = [point for point in points if point.pose is not None]
+    at = telemetry_of_video(film).at([point.time_s for point in found])
     known = at.has_position
     there = np.column_stack([at.latitude_deg, at.longitude_deg, np.zeros(len(found))])[known]
-    told = utm_from_geodetic(there, found[0][1].epsg)[:, :2]
-    off: FloatArray = np.array([pose.utm[:2] for _, pose in found])[known] - told
-    covariances = np.array([pose.covariance[3:5, 3:5] for _, pose in found])[known]
+    told = utm_from_geodetic(there, found[0].pose.epsg)[:, :2]
+    off: FloatArray = np.array([point.pose.utm[:2] for point in found])[known] - told
+    covariances = np.array([point.pose.covariance[3:5, 3:5] for point in found])[known]
     metres = np.linalg.norm(off, axis=1)
     squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances), off)
     radii = np.sqrt(_WITHIN * np.linalg.eigvalsh(covariances)[:, -1])
@@ -85,10 +84,7 @@ def against_keyframes(unplaced: UnplacedMap, points: Sequence[TrajectoryPoint]) 
         if found is not None:
             away.append(float(np.linalg.norm(found.cam_from_map.center - own.center)))
             turned.append(found.cam_from_map.angle_to_deg(own))
-    return {
-        "center_rel": float(np.median(away) / np.median(far)),
-        "angle_deg": float(np.median(turned)),
-    }
+    return {"center_rel": float(np.median(away) / np.median(far)), "angle_deg": float(np.median(turned))}
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Photos of simulated towns registered to scans that have intensities alone: one by one, and together.
 
-    python -m tools.frames_on_scan --work DIR [--inputs DIR]
-
 Of each town, on which nothing was chosen:
 
 - ten photos from 70 m, each from a prior that is 15 m and 10 degrees off, on the town's scan; and on the scan
@@ -54,13 +52,11 @@ _AXIS = 1.0 / np.sqrt(3.0)  # of a length along each axis
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
     cv2.setNumThreads(1)
-    towns, accepted = (
-        [
-            kept(args.work / f"{name}-{seed}.json", partial(of, seed, args.inputs, args.work))
-            for seed in _TOWNS
-        ]
-        for name, of in (("town", _found), ("elsewhere", _registered_elsewhere))
-    )
+    towns, accepted = [], 0
+    for seed in _TOWNS:
+        of = (seed, args.inputs, args.work)
+        towns.append(kept(args.work / f"town-{seed}.json", partial(_found, *of)))
+        accepted += kept(args.work / f"elsewhere-{seed}.json", partial(_registered_elsewhere, *of))
     singles = [np.array(one) for town in towns for one in town["singles"]]
     right = sum(one[0] <= _RIGHT_M and one[1] <= _RIGHT_DEG for one in singles)
     placed = [town["own_m"] for town in towns if town["own_m"] is not None]
@@ -72,7 +68,7 @@ def main() -> None:
             "right_share": right / (_PHOTOS * len(towns)),
             "singles_wrong": sum(one[0] > _WRONG_M for one in singles),
             "negatives": _NEGATIVES * len(towns),
-            "negatives_accepted": sum(accepted),
+            "negatives_accepted": accepted,
             "alone": sum(town["alone"] for town in towns),
             "alone_tried": _ALONE * len(towns),
             "placed": len(placed),
@@ -136,15 +132,13 @@ def _together(folder: Path, world: ScanWorld, work: Path, seed: int) -> dict[str
     def make_map(making: Path) -> None:
         rng = np.random.default_rng(seed)
         middle = (float(rng.uniform(-60.0, 60.0)), float(rng.uniform(-50.0, 50.0)))
-        flight = replace(_LOW, center_m=middle)
-        options = replace(WorldOptions.short(seed), flight=flight, queries=0, street=0, negatives_per_kind=0)
+        none = {"queries": 0, "street": 0, "negatives_per_kind": 0}
+        options = replace(WorldOptions.short(seed), flight=replace(_LOW, center_m=middle), **none)
         write_world(folder, options)
         make(making, "photos", folder / "drone")
 
     once(folder / "db", make_map)
-    truth = open_world(folder).truth
-    made = largest_map(folder / "db")
-    assert isinstance(made, FeatureMap)
+    truth, made = open_world(folder).truth, largest_map(folder / "db")
 
     def read(image: MapImage) -> NDArray[np.uint8]:
         return _gray(folder / "drone" / image.name)
@@ -155,19 +149,14 @@ def _together(folder: Path, world: ScanWorld, work: Path, seed: int) -> dict[str
     start = _misplaced(made, np.random.default_rng((seed, 99)))
     part = start.frame, plan_box(start)
     scans = [_cloud(scan, work, *part) for scan in (world.scan, world.other_scan)]
-    alone = [
-        register_frame(
-            read(image),
-            start.cameras[image.camera_id],
-            prior_off_by(image.cam_from_local, _OFF_M, _OFF_DEG),
-            scans[0],
-        ).accepted
-        for image in start.images[:_ALONE]
-    ]
+    alone = 0
+    for image in start.images[:_ALONE]:
+        prior = prior_off_by(image.cam_from_local, _OFF_M, _OFF_DEG)
+        alone += register_frame(read(image), start.cameras[image.camera_id], prior, scans[0]).accepted
     tried = try_frames(start, scans[0], read, FRAMES)
     placed = place_map(start, scans[0], tried, read, FRAMES).feature_map
     return {
-        "alone": sum(alone),
+        "alone": alone,
         "own_m": None if placed is None else float(np.median(camera_errors(placed, truth)[0])),
         "other": register_together(start, start.images, scans[1], read, 1) is not None,
         "mirrored": register_together(start, start.images, scans[0], mirrored, 1) is not None,
@@ -178,18 +167,16 @@ def _moved(middle: FloatArray, rng: np.random.Generator) -> Sim3:
     """A turn about a place, and a shift."""
     axis, way = (value / np.linalg.norm(value) for value in rng.normal(size=(2, 3)))
     turn = so3_exp(np.radians(_OFF_DEG) * axis)
-    return Sim3(scale=1.0, rotation=turn, translation=middle + _OFF_M * way - turn @ middle)
+    return Sim3(scale=1.0, rotation=turn, translation=_OFF_M * way).about(middle)
 
 
 def _misplaced(feature_map: FeatureMap, rng: np.random.Generator) -> FeatureMap:
     """The map moved, with a placement that says how far."""
     middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
     move = _moved(middle, rng)
-    about = Sim3(scale=1.0, rotation=np.eye(3), translation=move.act(middle))
     sigmas = [0.01, *[np.radians(_OFF_DEG) * _AXIS] * 3, *[_OFF_M * _AXIS] * 3]
-    covariance = about.carried(np.diag(np.square(sigmas)))
-    moved = move_map(feature_map, move)
-    return replace(moved, placement=replace(moved.placement, covariance=covariance))
+    covariance = Sim3.shift(move.act(middle)).carried(np.diag(np.square(sigmas)))
+    return move_map(feature_map, move, covariance=covariance)
 
 
 if __name__ == "__main__":

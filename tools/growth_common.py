@@ -27,9 +27,9 @@ from reloc.localise.result import LocaliseResult
 from reloc.localiser import Localiser
 from reloc.service.handler import decode_photo, localise_request
 from reloc.wire.query import LocaliseWireRequest
-from tools.figures import say, study_parser, write_figures
+from tools.figures import poses_in, say, study_parser, write_figures
 from tools.growth_gates import WRONG_M, recorded
-from tools.worlds.album import TABLE_FILE, AlbumFact, PlannedPhoto, read_facts, write_album
+from tools.worlds.album import TABLE_FILE, AlbumFact, PlannedPhoto, TownOptions, read_facts, write_album
 
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
 _SURVEY_SIGMA_M = (0.02, 0.03)
@@ -38,17 +38,13 @@ _MAKING = MapMakingOptions(
     extractor=ExtractorOptions(max_features=8000), maps=MapOptions(height_datum="ellipsoidal")
 )
 GROWING = GrowingOptions(making=_MAKING, workers=_WORKERS)
-W = TypeVar("W")
+W = TypeVar("W", bound=TownOptions)
 _UNSAID_M = 30.0  # accuracy of a geotag that names none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Album:
-    """An album on disk.
-
-    Attributes:
-        folder: of the photos. truth, facts: by name. rows: of the table, by name.
-    """
+    """An album on disk: the folder of its photos; truth, facts and rows of the table by their names."""
 
     folder: Path
     truth: Truth
@@ -57,11 +53,8 @@ class Album:
 
     def of(self, *kinds: str, batch: int | None = None) -> list[AlbumFact]:
         """Facts of these kinds, by name."""
-        return [
-            self.facts[name]
-            for name in sorted(self.facts)
-            if self.facts[name].kind in kinds and batch in (None, self.facts[name].batch)
-        ]
+        facts = [self.facts[name] for name in sorted(self.facts)]
+        return [fact for fact in facts if fact.kind in kinds and batch in (None, fact.batch)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,31 +94,27 @@ class Verdict(NamedTuple):
     holds: bool
 
 
-def world_told(
-    doc: str | None, argv: Sequence[str] | None, seed: int, world: Callable[..., W]
-) -> tuple[argparse.Namespace, W]:
-    """What a program of a made world is told, its folder made, and the world.
-
-    Args:
-        doc: of the program's module. seed: where none is told. world: by seed.
-    """
+def world_told(doc: str | None, argv: Sequence[str] | None, world: type[W]) -> tuple[argparse.Namespace, W]:
+    """What a program of a made world is told, its folder made, and the world; `doc`: of its module."""
     parser = study_parser(doc, "--work", "--seed")
-    parser.set_defaults(seed=seed)
+    parser.set_defaults(seed=world().seed)
     args = parser.parse_args(argv)
     return args, world(seed=args.seed)
 
 
-def made(plan: Callable[[Any], list[PlannedPhoto]], folder: Path, options: Any) -> "Album":
-    """The album of these options in `folder`, made or finished unless it is complete."""
+def surveyed(work: Path, options: W, plan: Callable[[W], list[PlannedPhoto]]) -> tuple[Album, Database]:
+    """The album of these options, made or finished unless it is complete, and a database of its survey."""
+    folder = work / "world"
 
     def progress(done: int, total: int) -> None:
         if done % 100 == 0 or done == total:
-            say(f"{folder.name}: {done} of {total} photos")
+            say(f"{done} of {total} photos")
 
     write_album(folder, options, partial(plan, options), progress=progress)
     lines = (folder / TABLE_FILE).read_text(encoding="utf-8").splitlines()
     rows = {row["path"]: row for row in map(json.loads, lines)}
-    return Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
+    album = Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
+    return album, anchored(work / "db", album, "survey")
 
 
 def anchored(path: Path, album: Album, survey: str) -> Database:
@@ -137,9 +126,7 @@ def anchored(path: Path, album: Album, survey: str) -> Database:
     report = ingest_photos(database, album.folder / survey, options)
     placed = [m for m in report.maps if m.status != "refused"]
     if len(placed) != 1:
-        raise SystemExit(
-            f"{survey}: expected one anchored map, found {[(m.status, m.reason) for m in report.maps]}"
-        )
+        raise SystemExit(f"{survey}: expected one anchored map, found {report.maps}")
     say(f"{survey}: {placed[0].photos} photos, {placed[0].points} points")
     return database
 
@@ -171,8 +158,7 @@ def give(database: Database, album: Album, facts: Iterable[AlbumFact]) -> None:
                 request=request,
             )
         )
-    for start in range(0, len(contributions), 50):
-        contribute(database, contributions[start : start + 50])
+    contribute(database, contributions)
 
 
 @lru_cache(maxsize=64)
@@ -190,14 +176,11 @@ def registered(database: Database, album: Album) -> list[Registered]:
     snapshot = database.snapshot()
     for summary in snapshot.maps():
         feature_map = snapshot.load_map(summary.map_id)
-        here = album.truth.frame.enu_from(feature_map.frame)
         bound_m = drift_m(feature_map.placement.covariance, places_of(feature_map))
-        for image in feature_map.images:
-            fact = album.facts[_album_name(album, image.name, feature_map.name)]
+        for name, pose in poses_in(album.truth.frame, feature_map).items():
+            fact = album.facts[_album_name(album, name, feature_map.name)]
             true = album.truth.images.get(fact.name)
-            offset = None
-            if true is not None:
-                offset = here.act(image.cam_from_local.center) - true.cam_from_local.center
+            offset = None if true is None else pose.center - true.cam_from_local.center
             found.append(
                 Registered(
                     fact=fact,
@@ -228,15 +211,18 @@ def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, header), header.size)
 
 
-def conclude(path: Path | None, verdicts: Sequence[Verdict]) -> int:
-    """Print what holds, and write it to a path; 0 if everything holds."""
-    document = {
-        "lines": {v.name: {"figure": v.text, "holds": v.holds} for v in verdicts},
-        "failed": sum(not v.holds for v in verdicts),
-        "summary": "; ".join(f"{v.name}: {v.text}" for v in verdicts),
-    }
-    write_figures(path, document)
-    return 0 if all(v.holds for v in verdicts) else 1
+def conclude(path: Path | None, verdicts: Sequence[Verdict], lost: int) -> int:
+    """Print what was measured, and write it to a path; 0 if everything holds.
+
+    Args:
+        lost: photos that a step lost by an exception that it did not foresee, not by a reason.
+    """
+    verdicts = [*verdicts, Verdict("no step failed", f"{lost} photos lost by an exception", lost == 0)]
+    failed = [v.name for v in verdicts if not v.holds]
+    say(f"does not hold: {', '.join(failed) or 'nothing'}")
+    summary = "; ".join(f"{v.name}: {v.text}" for v in verdicts)
+    write_figures(path, {"failed": len(failed), "summary": summary})
+    return 1 if failed else 0
 
 
 def grown(database: Database, out: Path, album: Album, gates: str = "gates") -> Counter[str]:
@@ -251,8 +237,3 @@ def grown(database: Database, out: Path, album: Album, gates: str = "gates") -> 
     for line in report.as_text().splitlines():
         say(line[:300])
     return Counter(p.reason_code for p in report.photos if p.reason_code)
-
-
-def none_failed(count: int) -> Verdict:
-    """Of photos that a step lost by an exception that it did not foresee, not by a reason."""
-    return Verdict("no step failed", f"{count} photos lost by an exception", count == 0)

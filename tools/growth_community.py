@@ -1,15 +1,9 @@
 """Twelve people's photos of a town that a survey has mapped in part: how many register, and how well?
 
-    python -m tools.growth_community --work DIR [--seed N]
-
 The world is that of `tools.worlds.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
 most of the photos, as on photo sites.
-
-Exit code 0 if at least 70 % of the town's photos are in
-active maps with a median error of at most 0.30 m, none of another town or of nowhere, and none is wrong by
-more than 2 m.
 """
 
 import sys
@@ -20,13 +14,11 @@ from tools.growth_common import (
     Album,
     Registered,
     Verdict,
-    anchored,
     conclude,
     give,
     grown,
-    made,
-    none_failed,
     registered,
+    surveyed,
     world_told,
 )
 from tools.worlds.community import CommunityOptions, community_album
@@ -37,13 +29,11 @@ _SHARE, _MEDIAN_M = 0.70, 0.30
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args, world = world_told(__doc__, argv, 1, CommunityOptions)
-    album = made(community_album, args.work / "world", world)
-    database = anchored(args.work / "db", album, "survey")
+    args, world = world_told(__doc__, argv, CommunityOptions)
+    album, database = surveyed(args.work, world, community_album)
     give(database, album, album.of(*_OWN, *_FOREIGN, "copy"))
     waiting = grown(database, args.work, album)
-    verdicts = [*judge(album, registered(database, album)), none_failed(waiting["FAILED"])]
-    return conclude(args.json, verdicts)
+    return conclude(args.json, judge(album, registered(database, album)), waiting["FAILED"])
 
 
 def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
@@ -57,8 +47,7 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
     pictures = {r.fact.name for r in mine} | {r.fact.copy_of for r in active if r.fact.kind == "copy"}
     share = len(pictures & {f.name for f in own}) / max(len(own), 1)
     errors = [r.error_m for r in mine]
-    middle = median(errors)
-    worst = max(errors, default=float("nan"))
+    middle, worst = median(errors), max(errors, default=float("nan"))
     return [
         Verdict(
             "registered",

@@ -17,7 +17,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -43,13 +43,10 @@ TruePlace = Callable[[str], FloatArray | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """One question to all gates of a step.
+    """One question to all gates of a step: "place", "refine", "budget" or "trust".
 
     Attributes:
-        step: "place", "refine", "budget" or "trust".
-        key: of the photos, sorted.
-        right, wrong: photos as they would lie.
-        gates: by name, whether it passes.
+        key: of the photos, sorted. right, wrong: photos as they would lie. gates: whether each passes.
     """
 
     step: str
@@ -65,70 +62,59 @@ class Judgement:
 
 @contextmanager
 def recorded(path: Path, frame: LocalFrame, true_place: TruePlace) -> Iterator[None]:
-    """Append every judgement of growth to a file as long as it lasts.
-
-    Args:
-        frame: of the true places.
-    """
+    """Append every judgement of growth to a file as long as it lasts; `frame`: of the true places."""
     with ExitStack() as stack, path.open("a", encoding="utf-8") as file:
         note = _Note(file=file, frame=frame, true_place=true_place)
-        for module, name, wrapped in (
-            (component, "place_by_maps", note.placing),
-            (component, "refine_placed", note.refining),
-            (map_graph, "with_drift", note.drifting),
-            (run, "promote_confirmed", note.promoting),
+        for module, name, told in (
+            (component, "place_by_maps", note.placed),
+            (component, "refine_placed", note.refined),
+            (map_graph, "with_drift", note.drifted),
+            (run, "promote_confirmed", note.promoted),
         ):
-            stack.enter_context(patch.object(module, name, wrapped(getattr(module, name))))
+            stack.enter_context(patch.object(module, name, _noted(getattr(module, name), told)))
         yield
 
 
+def _noted(step: Callable[..., Any], told: Callable[..., None]) -> Callable[..., Any]:
+    """A step of growth; `told` gets what it gives, and what it was given."""
+
+    def called(*args: Any, **more: Any) -> Any:
+        result = step(*args, **more)
+        told(result, *args)
+        return result
+
+    return called
+
+
 class _Note:
-    """The steps of growth, each with its judgement written down."""
+    """Writes down the judgement of each step of growth."""
 
     def __init__(self, *, file: Any, frame: LocalFrame, true_place: TruePlace) -> None:
         self._file, self._frame, self._true_place = file, frame, true_place
         self._photos: Sequence[Photo] = ()
 
-    def placing(self, step: Any) -> Any:
-        def place_by_maps(model: Any, localised: Any, keypoints: Any, photos: Any, *more: Any) -> Any:
-            placement = step(model, localised, keypoints, photos, *more)
-            self._photos = photos
-            self._model("place", model, placement, _said(placement.gates))
-            return placement
+    def placed(
+        self, placement: Any, model: Any, localised: Any, keypoints: Any, photos: Any, *_: Any
+    ) -> None:
+        self._photos = photos
+        self._model("place", model, placement, _said(placement.gates))
 
-        return place_by_maps
+    def refined(self, refined: Any, model: Any, placement: Any, *_: Any) -> None:
+        refused = isinstance(refined, Refused)
+        asked = refined.gates if refused else refined.placement.gates
+        own = {n: yes for n, yes in _said(asked).items() if n not in _said(placement.gates)}
+        if refused and all(own.values()):  # by photos that are left out
+            own[f"photos: {refined.reason}"] = False
+        self._model("refine", model, placement, own)
 
-    def refining(self, step: Any) -> Any:
-        def refine_placed(model: Any, placement: Any, *more: Any) -> Any:
-            refined = step(model, placement, *more)
-            refused = isinstance(refined, Refused)
-            asked = refined.gates if refused else refined.placement.gates
-            own = {n: yes for n, yes in _said(asked).items() if n not in _said(placement.gates)}
-            if refused and all(own.values()):  # by photos that are left out
-                own[f"photos: {refined.reason}"] = False
-            self._model("refine", model, placement, own)
-            return refined
+    def drifted(self, found: Any, grown: Any, maps: Any, budget_m: float) -> None:
+        self._map("budget", found[0], _said([gates.drift(found[1], budget_m)]))
 
-        return refine_placed
-
-    def drifting(self, step: Any) -> Any:
-        def with_drift(grown: Any, maps: Any, budget_m: float) -> Any:
-            found = step(grown, maps, budget_m)
-            self._map("budget", found[0], _said([gates.drift(found[1], budget_m)]))
-            return found
-
-        return with_drift
-
-    def promoting(self, step: Any) -> Any:
-        def promote_confirmed(database: Any, *args: Any, **more: Any) -> Any:
-            outcomes = step(database, *args, **more)
-            for outcome in outcomes:
-                if outcome.gates:
-                    said = {name: bool(gate["passes"]) for name, gate in outcome.gates.items()}
-                    self._map("trust", database.snapshot().load_map(outcome.map_id), said)
-            return outcomes
-
-        return promote_confirmed
+    def promoted(self, outcomes: Any, database: Any, *_: Any) -> None:
+        for outcome in outcomes:
+            if outcome.gates:
+                said = {name: bool(gate["passes"]) for name, gate in outcome.gates.items()}
+                self._map("trust", database.snapshot().load_map(outcome.map_id), said)
 
     def _model(self, step: str, model: Any, placement: Any, gates: dict[str, bool]) -> None:
         if isinstance(placement, Refused):  # nothing fits
@@ -147,13 +133,8 @@ class _Note:
         for name, center in zip(names, centers, strict=True):
             true = self._true_place(name)
             wrong += true is None or float(np.linalg.norm(center - true)) > WRONG_M
-        line = {
-            "step": step,
-            "key": " ".join(sorted(names)),
-            "right": len(names) - wrong,
-            "wrong": wrong,
-            "gates": gates,
-        }
+        right, key = len(names) - wrong, " ".join(sorted(names))
+        line = asdict(Judgement(step=step, key=key, right=right, wrong=wrong, gates=gates))
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
 

@@ -1,7 +1,5 @@
 """Poison: look-alike blocks, mirrors, liars and forgers send photos. Is anything wrong promoted?
 
-    python -m tools.growth_poison --work DIR [--seed N]
-
 The world is that of `tools.worlds.poison_world`. The survey is ingested, honest photos are grown, and
 held-out photos become canaries with their true poses. Then a copy of that database gets all kinds of poison
 together, grows, gets honest photos that come later, and grows again. Whatever is active then is compared with
@@ -15,8 +13,6 @@ the truth:
 Then wrong maps are forced in by hand: every quarantined map with poison, and, so that there is always one, an
 honest grown map moved by 3 m under a new id. Answers to the canaries and to honest photos are compared,
 before, while it is in service, and after `retire`: bit for bit, but for the number of the snapshot.
-
-Exit code 0 if nothing wrong was promoted and every answer came back.
 """
 
 import json
@@ -43,14 +39,12 @@ from tools.commands import newest_copy
 from tools.growth_common import (
     Album,
     Verdict,
-    anchored,
     answer_of,
     conclude,
     give,
     grown,
-    made,
-    none_failed,
     registered,
+    surveyed,
     world_told,
 )
 from tools.worlds.poison_world import POISONS, PoisonOptions, poison_album
@@ -65,11 +59,9 @@ class PoisonOutcome:
     """What the poison did.
 
     Attributes:
-        sent: photos. active: of them, in such maps. wrong: photos registered wrongly in active
-            maps by their kind, the poison's and honest ones alike.
+        sent: photos. active: of them, in such maps. wrong: photos of any kind that active maps have wrongly.
         off_share: largest share of points off the true surface among active grown maps with poison.
-        forced: maps that were forced in. restored: whether all answers came back.
-        failed: photos lost by an exception.
+        forced: maps that were forced in. restored: whether all answers came back. failed: lost photos.
     """
 
     sent: int
@@ -82,21 +74,20 @@ class PoisonOutcome:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args, world = world_told(__doc__, argv, 4, PoisonOptions)
-    album = made(poison_album, args.work / "world", world)
-    base = honest_base(args.work / "db", album)
+    args, world = world_told(__doc__, argv, PoisonOptions)
+    album, base = surveyed(args.work, world, poison_album)
+    grow_honest(base, album)
     clean = max(off_shares(base, album, world).values(), default=0.0)
     outcome = try_poison(args.work, base, album, world)
     forced = Database.open(newest_copy(args.work / "db", args.work / "db-forced"))
-    fabricated = force_and_retire(forced, album, [], fabricate=True)
-    return conclude(args.json, judge(outcome, clean, fabricated))
+    fabricated = force_and_retire(forced, album, [moved_copy(forced)])
+    return conclude(args.json, judge(outcome, clean, fabricated), outcome.failed)
 
 
-def honest_base(path: Path, album: Album) -> Database:
-    """The database before any poison: survey, honest photos, canaries."""
-    database = anchored(path, album, "survey")
+def grow_honest(database: Database, album: Album) -> None:
+    """Honest photos and canaries, before any poison."""
     if any(m.method == "map" for m in database.snapshot().maps()):
-        return database
+        return
     for fact in album.of("canary"):
         true = album.truth.images[fact.name]
         grid = album.truth.frame.grid_from_enu(true.cam_from_local.center, album.truth.epsg)
@@ -110,8 +101,7 @@ def honest_base(path: Path, album: Album) -> Database:
         )
         add_canary(database, fact.photo_id, (album.folder / fact.name).read_bytes(), pose, origin="person")
     give(database, album, album.of("honest"))
-    grown(database, path.parent, album)
-    return database
+    grown(database, Path(database.url).parent, album)
 
 
 def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) -> PoisonOutcome:
@@ -126,10 +116,8 @@ def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) ->
     active = [r for r in found if r.status == "active" and r.generation > 0]
     poisoned = {r.map_id for r in active if r.fact.kind in POISONS}
     shares = off_shares(database, album, world)
-    held = sorted(
-        {r.map_id for r in found if r.status == "quarantined" and (r.fact.kind in POISONS or r.wrong)}
-    )
-    forced = force_and_retire(database, album, held, fabricate=False)
+    held = {r.map_id for r in found if r.status == "quarantined" and (r.fact.kind in POISONS or r.wrong)}
+    forced = force_and_retire(database, album, sorted(held))
     return PoisonOutcome(
         sent=len(sent),
         active=sum(r.fact.kind in POISONS for r in active),
@@ -142,11 +130,7 @@ def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) ->
 
 
 def off_shares(database: Database, album: Album, world: PoisonOptions) -> dict[str, float]:
-    """For each active grown map, the share of its points' observations off the surface that is truly there.
-
-    The depth that the true camera sees at an observation's pixel against that of the map's point; edges of
-    things, where a pixel decides, are left out.
-    """
+    """For each active grown map, the share of its points' observations off what truly is there."""
     shares, found = {}, registered(database, album)
     for summary in database.snapshot().maps():
         if summary.status == "active" and summary.method == "map":
@@ -157,12 +141,12 @@ def off_shares(database: Database, album: Album, world: PoisonOptions) -> dict[s
 
 
 def _off_share(feature_map: FeatureMap, album: Album, world: PoisonOptions, names: Sequence[str]) -> float:
+    """By the depth that the true camera sees at an observation's pixel, where it is no edge."""
     scene, seen = world.scene("home/0/000"), feature_map.observations
     points = album.truth.frame.enu_from(feature_map.frame).act(feature_map.points_local())
     off = total = 0
     for image, name in zip(feature_map.images, names, strict=True):
-        true = album.truth.images.get(name)
-        if true is None:
+        if (true := album.truth.images.get(name)) is None:
             continue
         rows = seen.image_id == image.image_id
         depth = render_depth(scene, true.camera, true.cam_from_local).depth
@@ -180,17 +164,10 @@ def _off_share(feature_map: FeatureMap, album: Album, world: PoisonOptions, name
     return off / max(total, 1)
 
 
-def force_and_retire(
-    database: Database, album: Album, held: Sequence[str], *, fabricate: bool
-) -> dict[str, Any]:
+def force_and_retire(database: Database, album: Album, held: Sequence[str]) -> dict[str, Any]:
     """Force maps in by hand and take them out again; whether answers changed, and whether they came back."""
     before = answers(database, album)
-    forced = [*held, _moved_copy(database)] if fabricate else held
-    done = [
-        map_id
-        for map_id in forced
-        if promote_by_hand(database, map_id, "forced for the test", force=True).promoted
-    ]
+    done = [one for one in held if promote_by_hand(database, one, "forced for the test", force=True).promoted]
     during = answers(database, album) if done else before
     for map_id in done:
         if database.snapshot().get(map_id).status != "retired":
@@ -199,13 +176,13 @@ def force_and_retire(
     return {"forced": len(done), "changed": during != before, "restored": after == before}
 
 
-def _moved_copy(database: Database) -> str:
+def moved_copy(database: Database) -> str:
     """A grown map under a new id, 3 m to the east of where it belongs, in quarantine; its id."""
     source = next((m for m in database.snapshot().maps() if m.method == "map" and m.status == "active"), None)
     if source is None:
         raise SystemExit("no honest map has grown, so there is none to be moved")
     feature_map = database.snapshot().load_map(source.map_id)
-    move = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([_MOVE_M, 0.0, 0.0]))
+    move = Sim3.shift(np.array([_MOVE_M, 0.0, 0.0]))
     wrong = replace(move_map(feature_map, move), map_id="f" * 24, status="quarantined")
     database.commit_map(wrong)
     return wrong.map_id
@@ -217,11 +194,9 @@ def answers(database: Database, album: Album) -> dict[str, str]:
     found = {}
     for fact in [*album.of("canary"), *album.of("honest")[:20]]:
         result = answer_of(localiser, album.folder / fact.name)
-        pose = result.pose
         figures: list[Any] = [result.reason, result.inliers, result.matches, result.confidence]
-        if pose is not None:
-            figures += [pose.utm, pose.cam_from_utm_xyzw, pose.covariance, pose.map_ids]
-            figures += [dict(entry) for entry in pose.lineage]
+        if (pose := result.pose) is not None:
+            figures += [pose.utm, pose.cam_from_utm_xyzw, pose.covariance, pose.map_ids, *pose.lineage]
         found[fact.name] = json.dumps(plain(figures))
     return found
 
@@ -245,7 +220,6 @@ def judge(o: PoisonOutcome, clean: float, fabricated: dict[str, Any]) -> list[Ve
             f"{'came back' if fabricated['restored'] else 'DID NOT COME BACK'}",
             o.restored and fabricated["restored"] and fabricated["changed"],
         ),
-        none_failed(o.failed),
     ]
 
 

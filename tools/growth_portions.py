@@ -1,7 +1,5 @@
 """Real photos in three portions: a first map, the others added by growth, compared with all at once.
 
-    python -m tools.growth_portions --photos FOLDER --cut interleaved --work WORK
-
 1. Joint: all photos are reconstructed at once. The largest reconstruction is the reference.
 2. Portions: the photos, sorted by name, are cut into three, by turns (interleaved) or one after the other
    (consecutive). The first reconstruction of at least five photos is placed by GPS,
@@ -15,7 +13,7 @@
 """
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -60,11 +58,9 @@ class State:
 
     Attributes:
         photos: all of the set. waiting: rows that are in no map yet.
-        poses: of registered photos in the first map's frame, by name.
-        frame: of the first map.
+        poses: of registered photos in `frame`, which is the first map's, by name.
         growth: without a drift budget where the first map's metre is made up.
-        joint: the joint reconstruction.
-        gates: where what the gates say is recorded, beside the joint reconstruction's places.
+        joint: the joint reconstruction. gates: where what the gates say is recorded, beside its places.
     """
 
     photos: list[Photo]
@@ -104,10 +100,8 @@ def main() -> None:
 def portions(count: int, cut: str) -> list[list[int]]:
     """Rows of the three portions: by turns, or one after the other."""
     rows = np.arange(count)
-    parts = [rows[i::_PORTIONS] for i in range(_PORTIONS)]
-    if cut == "consecutive":
-        parts = np.array_split(rows, _PORTIONS)
-    return [part.tolist() for part in parts]
+    by_turns = [rows[i::_PORTIONS] for i in range(_PORTIONS)]
+    return [part.tolist() for part in (by_turns if cut == "interleaved" else np.array_split(rows, _PORTIONS))]
 
 
 def _take_in(state: State) -> None:
@@ -138,21 +132,18 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
     """A map without GPS at a made-up place; None for one whose GPS was refused."""
     if any(photo.gps is not None for photo in component.photos):
         return None
-    model = component.model
-    scale = _MADE_UP_DISTANCE_M / _reach(model)
+    scale = _MADE_UP_DISTANCE_M / _reach(component.model)
     placement = Placement(
         method="gcp",
-        local_from_sfm=Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3)),
+        local_from_sfm=replace(Sim3.identity(), scale=scale),
         covariance=np.diag([1e-8, 1e-8, 1e-8, 1e-8, 1e-4, 1e-4, 1e-4]),
         residual_rms_m=0.0,
         evidence={"made_up": True},
     )
     key, kept = features_key(_MAKING.extractor), Workspace(root=state.work)
     features = [read_features(kept.features(key, photo.sha256)) for photo in component.photos]
-    rows = [state.photos.index(photo) for photo in component.photos]
-    return build_map(
-        model, placement, _MADE_UP_FRAME, component.photos, features, _identity(rows), _MAKING.maps
-    )
+    identity, photos = _identity([state.photos.index(photo) for photo in component.photos]), component.photos
+    return build_map(component.model, placement, _MADE_UP_FRAME, photos, features, identity, _MAKING.maps)
 
 
 def _reach(model: Model) -> float:
@@ -199,9 +190,8 @@ def _find_poses(state: State) -> None:
 
 def _reconstruct(photos: Sequence[Photo], rows: Sequence[int], work: Path) -> list[Component]:
     """Reconstructions of the photos of the given rows, largest first."""
-    identity: Callable[[int], MapIdentity] = lambda number: _identity([*rows, number])  # noqa: E731
     made = _reconstructed(photos, rows, work)
-    done = list(place_models(made, _MAKING, identity=identity))
+    done = place_models(made, _MAKING, identity=lambda number: _identity([*rows, number]))
     return sorted(done, key=lambda c: -len(c.photos))
 
 
@@ -220,7 +210,7 @@ def _judged(state: State) -> dict[str, float]:
     placed = state.joint.placement
     sim = placed.local_from_sfm if placed.reason is None else None
     scale = _EXTENT_M / float(np.linalg.norm(np.ptp(state.joint.model.centers(), axis=0)))
-    sim = sim or Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3))
+    sim = sim or replace(Sim3.identity(), scale=scale)
     reference = {name: sim.act(pose.center) for name, pose in state.joint_poses.items()}
     apart = laid_apart({name: pose.center for name, pose in state.poses.items()}, reference)
     return {

@@ -1,7 +1,5 @@
 """What an ingest costs and maps beside COLMAP's own pipeline on the same photos; processor time of one run.
 
-    python -m tools.ingest_benchmark FOLDER [FOLDER ...] [--json FILE]
-
 COLMAP is pycolmap: SIFT of photos at 1600 px, pairs of 15 neighbours where photos have positions and all
 pairs where they have none, incremental mapping. Ours is `featuredb ingest photos` into a new database, to the
 commit. Each is a process of its own, the one after the other.
@@ -13,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.maps.feature_map import FeatureMap
-from tools.commands import all_maps, processor_s
+from tools.commands import all_maps, cost_of
 from tools.figures import study_parser, write_figures
 
 _NEIGHBOURS = 15
@@ -56,19 +54,19 @@ def measured(folder: Path) -> dict[str, float]:
     """Both programs over the photos of a folder: processor seconds, photos in the largest model or map and in
     both, maps with a place."""
     with tempfile.TemporaryDirectory() as scratch:
-        colmap_s, _, told = processor_s("-c", _THEIRS, str(folder), scratch)
+        colmap = cost_of("-c", _THEIRS, str(folder), scratch)
         database = Path(scratch) / "db"
-        words = ("-m", "featuredb.cli", "ingest", "photos", str(database), str(folder), "--quiet")
-        ours_s, *_ = processor_s(*words)
+        words = ("ingest", "photos", str(database), str(folder), "--quiet")
+        ours_s = cost_of("-m", "featuredb.cli", *words).seconds
         maps = all_maps(database)
-    theirs = set(json.loads(told.splitlines()[-1]))
+    theirs = set(json.loads(colmap.told.splitlines()[-1]))
     ours = {image.name for image in max(maps, key=lambda one: len(one.images)).images}
     return {
-        "colmap_s": colmap_s,
+        "colmap_s": colmap.seconds,
         "colmap_photos": len(theirs),
         "ours_s": ours_s,
         "ours_photos": len(ours),
-        "ratio": ours_s / colmap_s,
+        "ratio": ours_s / colmap.seconds,
         "both": len(theirs & ours),
         "share": len(theirs & ours) / max(1, len(theirs)),
         "placed": sum(isinstance(one, FeatureMap) for one in maps),

@@ -1,7 +1,5 @@
 """One landmark by many people, a third of whom say where they were: placed as well as that allows?
 
-    python -m tools.landmark_tags --photos FOLDER --work DIR [--json FILE]
-
 1. The photos, without positions, become a map. It is the truth, with the building's front 137 m wide.
 2. A third of its photos get geotags that are off by 8 m, in a table that says nothing of accuracy. The table
    is ingested by `featuredb ingest photos --trust-geotags`.
@@ -11,6 +9,7 @@
 """
 
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -22,21 +21,11 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import point_jacobian
-from featuredb.store import Database
 from ingest.own_frame import held_of
 from ingest.photos.photo import Photo, whose_cameras
 from ingest.register.gps import place_by_gps
-from tools.commands import featuredb, largest_map, make
-from tools.figures import (
-    inside_figures,
-    laid_apart,
-    median,
-    poses_in,
-    say,
-    squared,
-    study_parser,
-    write_figures,
-)
+from tools.commands import all_maps, featuredb, largest_map, make
+from tools.figures import inside_figures, laid_apart, median, poses_in, squared, study_parser, write_figures
 from tools.photo_files import copied, photo_names, position_table
 
 _FRONT_M, _OFF_M, _STATED_M = 137.0, 8.0, 30.0
@@ -44,12 +33,8 @@ _FRONT = (2.0, 98.0)  # percentiles of the points along it
 _FRAME = LocalFrame(latitude_deg=52.5186, longitude_deg=13.3750, height_m=75.0)
 _COUNTS = (5, 8, 15, 25)
 _DRAWS, _SEED = 40, 1  # of each kind and number
-_KINDS = {
-    "8 m": (8.0, 0.0, 0.0),
-    "far out": (8.0, 0.2, 0.0),
-    "pinned": (8.0, 0.0, 0.3),
-    "15 m": (15.0, 0.0, 0.0),
-}
+# Off by how much, metres; shares of tags that are far out, and on the landmark.
+_KINDS = ((8.0, 0.0, 0.0), (8.0, 0.2, 0.0), (8.0, 0.0, 0.3), (15.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,20 +84,18 @@ def true_landmark(database: Path) -> Landmark:
 
 def ingested(landmark: Landmark, photos: Path, work: Path) -> dict[str, float]:
     """What the command makes of a table in which a third of the photos have a geotag."""
-    folder = copied(photos, photo_names(photos), work / "tagged", strip=False)
+    names = photo_names(photos)
+    folder = copied(photos, names, work / "tagged", strip=False)
     rng = np.random.default_rng(_SEED)
     rows = rng.choice(len(landmark.names), len(landmark.names) // 3, replace=False)
     tags = _FRAME.geodetic_from_enu(landmark.xyz[rows] + rng.normal(0.0, _OFF_M, (len(rows), 3)))
     told = {landmark.names[k]: (f"{tag[0]:.7f}", f"{tag[1]:.7f}") for k, tag in zip(rows, tags, strict=True)}
-    names = photo_names(photos)
     table = position_table(folder, [(name, *told.get(name, ("", "")), "", "", "") for name in names])
     featuredb("ingest", "photos", str(work / "db"), str(table), "--trust-geotags", "--quiet", refusals=(1,))
-    snapshot = Database.open(work / "db").snapshot()
     places: dict[str, FloatArray] = {}
-    for summary in snapshot.maps():
-        if summary.status == "active":
-            poses = poses_in(_FRAME, snapshot.load_map(summary.map_id))
-            places |= {Path(name).name: pose.center for name, pose in poses.items()}
+    for one in all_maps(work / "db"):
+        if one.status == "active":
+            places |= {Path(name).name: pose.center for name, pose in poses_in(_FRAME, one).items()}
     true = dict(zip(landmark.names, landmark.xyz, strict=True))
     off = [np.linalg.norm((places[name] - true[name])[:2]) for name in true.keys() & places.keys()]
     return {
@@ -126,31 +109,26 @@ def ingested(landmark: Landmark, photos: Path, work: Path) -> dict[str, float]:
 
 def drawn(landmark: Landmark) -> dict[str, float]:
     """Places by drawn geotags, as ingest makes them: squared errors over their covariances."""
-    scores: dict[str, list[tuple[float, float]]] = {"answering": [], "waiting": []}
-    for number, (kind, (off_m, far, pinned)) in enumerate(_KINDS.items()):
-        for count in _COUNTS:
-            for draw in range(_DRAWS):
-                rng = np.random.default_rng((_SEED, number, count, draw))
-                rows = np.sort(rng.choice(len(landmark.names), count, replace=False))
-                tags = landmark.xyz[rows] + rng.normal(0.0, off_m, (count, 3))
-                out, on = rng.random(count) < far, rng.random(count) < pinned
-                tags[out, :2] += rng.normal(0.0, 150.0, (int(out.sum()), 2))
-                tags[on] = landmark.middle + rng.normal(0.0, 15.0, (int(on.sum()), 3))
-                sigmas = np.tile([_STATED_M, _STATED_M, np.inf if draw % 2 else _STATED_M], (count, 1))
-                held = held_of(landmark.poses, (), landmark.camera_of)
-                placed = place_by_gps(landmark.xyz[rows], tags, sigmas, None, held, landmark.camera_of[rows])
-                if placed.local_from_sfm is None or placed.covariance is None or placed.reason is not None:
-                    continue
-                error = placed.local_from_sfm.inverse().log()
-                camera = point_jacobian(landmark.xyz[[rng.integers(len(landmark.names))]])[0, :2]
-                position, orientation = (
-                    squared(rows @ error, rows @ placed.covariance @ rows.T)
-                    for rows in (camera, np.eye(7)[1:4])
-                )
-                scores["waiting" if placed.provisional else "answering"].append((position, orientation))
-            counts = ", ".join(f"{len(of)} {name}" for name, of in scores.items())
-            say(f"{kind:<8} {count:>3} tags: {counts} so far")
-    result = {"draws": float(_DRAWS * len(_KINDS) * len(_COUNTS))}
+    scores: dict[str, list[list[float]]] = {"answering": [], "waiting": []}
+    kinds = list(product(enumerate(_KINDS), _COUNTS, range(_DRAWS)))
+    held = held_of(landmark.poses, (), landmark.camera_of)
+    for (number, (off_m, far, pinned)), count, draw in kinds:
+        rng = np.random.default_rng((_SEED, number, count, draw))
+        rows = np.sort(rng.choice(len(landmark.names), count, replace=False))
+        tags = landmark.xyz[rows] + rng.normal(0.0, off_m, (count, 3))
+        out, on = rng.random(count) < far, rng.random(count) < pinned
+        tags[out, :2] += rng.normal(0.0, 150.0, (int(out.sum()), 2))
+        tags[on] = landmark.middle + rng.normal(0.0, 15.0, (int(on.sum()), 3))
+        sigmas = np.tile([_STATED_M, _STATED_M, np.inf if draw % 2 else _STATED_M], (count, 1))
+        placed = place_by_gps(landmark.xyz[rows], tags, sigmas, None, held, landmark.camera_of[rows])
+        if placed.local_from_sfm is None or placed.covariance is None or placed.reason is not None:
+            continue
+        error = placed.local_from_sfm.inverse().log()
+        camera = point_jacobian(landmark.xyz[[rng.integers(len(landmark.names))]])[0, :2]
+        parts = (camera, np.eye(7)[1:4])  # of position and orientation
+        square = [squared(part @ error, part @ placed.covariance @ part.T) for part in parts]
+        scores["waiting" if placed.provisional else "answering"].append(square)
+    result = {"draws": float(len(kinds))}
     for name, of in scores.items():
         result[name] = len(of) / result["draws"]
         for k, (part, size) in enumerate((("position", 2), ("orientation", 3))):

@@ -1,7 +1,7 @@
 """A set of photos with laser truth, in Strecha's format: its cameras, and copies of its photos with EXIF.
 
-FOLDER has images/ and cameras/, a `NAME.camera` for each photo: calibration, distortion, camera-to-world
-rotation, centre in metres, size of the full picture. The centre of the top-left pixel is (0, 0) there.
+FOLDER has images/, and cameras/ with a `0000.camera` for each photo `0000.jpg`: calibration, distortion,
+camera-to-world rotation, centre in metres, size of the full picture; the first pixel's centre is (0, 0).
 """
 
 import tempfile
@@ -23,7 +23,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3
-from tools.photo_files import with_place
+from tools.photo_files import photo_names, with_place
 
 FRAME = LocalFrame(latitude_deg=49.0, longitude_deg=8.4, height_m=150.0)  # somewhere on Earth
 SIGMA_M = 0.02  # that positions claim
@@ -59,35 +59,23 @@ class LaserSet:
 
 def read_laser_set(folder: Path) -> LaserSet:
     """The set in a folder."""
-    photos = folder / "images" if (folder / "images").is_dir() else folder
-    names = sorted(p.name for p in photos.iterdir() if p.suffix.lower() in (".jpg", ".jpeg"))
-    if not names:
-        raise SystemExit(f"{photos}: expected JPEG files, found none")
-    files = {name: camera_file(folder / "cameras", name) for name in names}
-    with Image.open(photos / names[0]) as picture:
-        size = picture.size
-    return LaserSet(
-        photos=photos,
-        poses=upright({name: true_pose(file) for name, file in files.items()}),
-        camera=true_camera(files[names[0]], *size),
-    )
+    photos = folder / "images"
+    files = {name: folder / "cameras" / f"{Path(name).stem}.camera" for name in photo_names(photos)}
+    first, *_ = files
+    with Image.open(photos / first) as picture:
+        camera = true_camera(files[first], *picture.size)
+    poses = upright({name: true_pose(file) for name, file in files.items()})
+    return LaserSet(photos=photos, poses=poses, camera=camera)
 
 
 def upright(poses: dict[str, Rigid3]) -> dict[str, Rigid3]:
     """The poses in a world whose z axis is the mean of the cameras' up, around their mean centre."""
     up = -np.sum([pose.rotation[1] for pose in poses.values()], axis=0)
     east = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    local_from_world = nearest_rotation(
-        np.stack([v / np.linalg.norm(v) for v in (east, np.cross(up, east), up)])
-    )
+    turn = nearest_rotation(np.stack([v / np.linalg.norm(v) for v in (east, np.cross(up, east), up)]))
     middle = np.mean([pose.center for pose in poses.values()], axis=0)
-    local = {}
-    for name, pose in poses.items():
-        rotation = pose.rotation @ local_from_world.T
-        local[name] = Rigid3(
-            rotation=rotation, translation=-rotation @ local_from_world @ (pose.center - middle)
-        )
-    return local
+    upright_from_world = Sim3(scale=1.0, rotation=turn, translation=-turn @ middle)
+    return {name: upright_from_world.act_on_pose(pose) for name, pose in poses.items()}
 
 
 def with_exif(truth: LaserSet, names: Sequence[str], folder: Path, *, positions: bool) -> Path:
@@ -105,19 +93,10 @@ def with_exif(truth: LaserSet, names: Sequence[str], folder: Path, *, positions:
     return folder
 
 
-def camera_file(folder: Path, photo: str) -> Path:
-    """Its camera: `0000.camera` or `0000.png.camera`."""
-    found = [p for p in (folder / f"{Path(photo).stem}.camera", folder / f"{photo}.camera") if p.is_file()]
-    if not found:
-        raise SystemExit(f"{folder}: no camera of photo {photo}")
-    return found[0]
-
-
 def true_pose(path: Path) -> Rigid3:
     """The pose in a file of Strecha's: cam_from_world."""
     rows = _rows(path)
-    world_from_cam, center = nearest_rotation(rows[_ROTATION_LINES]), np.array(rows[_CENTER_LINE])
-    return Rigid3(rotation=world_from_cam.T, translation=-world_from_cam.T @ center)
+    return Rigid3.from_center(nearest_rotation(rows[_ROTATION_LINES]).T, np.array(rows[_CENTER_LINE]))
 
 
 def true_camera(path: Path, width: int, height: int) -> Camera:
@@ -159,24 +138,18 @@ def colmap_given_the_lens(truth: LaserSet) -> tuple[dict[str, Rigid3], dict[str,
         if not found:
             raise SystemExit("COLMAP makes no model of the photos, even with the true lens")
         model = max(found.values(), key=lambda one: one.num_reg_images())
-        poses = {model.image(i).name: _pose(model.image(i)) for i in model.reg_image_ids()}
-        move = robust_similarity(
-            centers(list(poses.values())), centers([truth.poses[name] for name in poses])
-        )
-        known = _described_points(model, database)
-        asked = {}
-        queries = _extracted(truth, truth.asked, work / "asked.db")
-        with pycolmap.Database.open(str(queries)) as read:
+        images = [model.image(i) for i in model.reg_image_ids()]
+        poses = {one.name: Rigid3.from_matrix(one.cam_from_world().matrix()) for one in images}
+        move = robust_similarity(centers(list(poses.values())), centers([truth.poses[n] for n in poses]))
+        known, asked = _described_points(model, database), {}
+        with pycolmap.Database.open(str(_extracted(truth, truth.asked, work / "asked.db"))) as read:
             for image in read.read_all_images():
-                pose = _localised(
-                    read.read_keypoints(image.image_id)[:, :2],
-                    read.read_descriptors(image.image_id).data,
-                    known,
-                    truth,
-                )
+                pixels = read.read_keypoints(image.image_id)[:, :2]
+                pose = _localised(pixels, read.read_descriptors(image.image_id).data, known, truth.camera)
                 if pose is not None:
-                    asked[image.name] = move.act_on_pose(pose)
-    return {name: move.act_on_pose(pose) for name, pose in poses.items()}, asked
+                    asked[image.name] = pose
+    mapped, answered = ({n: move.act_on_pose(pose) for n, pose in of.items()} for of in (poses, asked))
+    return mapped, answered
 
 
 def robust_similarity(source: FloatArray, target: FloatArray) -> Sim3:
@@ -188,11 +161,7 @@ def robust_similarity(source: FloatArray, target: FloatArray) -> Sim3:
         raise SystemExit("the cameras lie on a line or a point; no similarity can be told")
     inliers = np.asarray(found["inlier_mask"], dtype=bool)
     best = pycolmap.estimate_sim3d(source[inliers], target[inliers]) or found["tgt_from_src"]
-    return Sim3(
-        scale=float(best.scale),
-        rotation=np.array(best.rotation.matrix()),
-        translation=np.array(best.translation),
-    )
+    return Sim3(scale=best.scale, rotation=best.rotation.matrix(), translation=best.translation)
 
 
 def _extracted(truth: LaserSet, names: Sequence[str], database: Path) -> Path:
@@ -221,11 +190,9 @@ def _described_points(model: pycolmap.Reconstruction, database: Path) -> _Known:
     point, descriptors = [], []
     with pycolmap.Database.open(str(database)) as read:
         for image_id in model.reg_image_ids():
-            seen = [
-                (k, p.point3D_id) for k, p in enumerate(model.image(image_id).points2D) if p.has_point3D()
-            ]
-            descriptors.append(read.read_descriptors(image_id).data[[k for k, _ in seen]])
-            point += [p for _, p in seen]
+            seen = {k: p.point3D_id for k, p in enumerate(model.image(image_id).points2D) if p.has_point3D()}
+            descriptors.append(read.read_descriptors(image_id).data[list(seen)])
+            point += seen.values()
     return _Known(
         xyz=np.array([model.point3D(p).xyz for p in point]),
         point=np.array(point),
@@ -233,7 +200,7 @@ def _described_points(model: pycolmap.Reconstruction, database: Path) -> _Known:
     )
 
 
-def _localised(pixels: FloatArray, asked: NDArray[np.uint8], known: _Known, truth: LaserSet) -> Rigid3 | None:
+def _localised(pixels: FloatArray, asked: NDArray[np.uint8], known: _Known, lens: Camera) -> Rigid3 | None:
     """cam_from_model; None where too few matches fit."""
     rows: list[int] = []
     seen: list[int] = []
@@ -246,7 +213,6 @@ def _localised(pixels: FloatArray, asked: NDArray[np.uint8], known: _Known, trut
         good = (norm - 2 * first) < _RATIO**2 * (norm - 2 * likeness.max(axis=1))
         rows += (start + np.flatnonzero(good)).tolist()
         seen += best[good].tolist()
-    lens = truth.camera
     camera = {"model": lens.model, "width": lens.width, "height": lens.height, "params": list(lens.params)}
     pose, info = poselib.estimate_absolute_pose(
         pixels[rows].astype(np.float64), known.xyz[seen], camera, {"max_reproj_error": _TOLERANCE_PX}, {}
@@ -255,7 +221,3 @@ def _localised(pixels: FloatArray, asked: NDArray[np.uint8], known: _Known, trut
         return None
     w, x, y, z = pose.q
     return Rigid3.from_quaternion([x, y, z, w], pose.t)
-
-
-def _pose(image: pycolmap.Image) -> Rigid3:
-    return Rigid3.from_matrix(image.cam_from_world().matrix())

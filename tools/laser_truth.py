@@ -1,15 +1,13 @@
 """Maps and answers against laser truth (Strecha's sets), beside plain COLMAP that is given the true lens.
 
-    python -m tools.laser_truth FOLDER [--json FILE]
-
 Of the folder (see `tools.laser_set`) all photos but every fifth from the third on are ingested into a new
 database, with exact positions and the EXIF of one camera whose focal length is rounded to a whole
 millimetre of 35 mm film. The other photos are asked of a server twice: with their true camera, and with EXIF
-alone. Prints, for the map's cameras and for both kinds of answers: the median error of position
-and orientation, the median of the 68 % radius that was reported, and the baseline's median
-(`tools.laser_set`); and how far the map's lens is from the true one, over the standard deviations that
-the map stores of it (root mean square of its parameters: 1 is right). Worst is the largest ratio
-of a median to the baseline's, or to the reported radius.
+alone. Prints, for the map's cameras and for both kinds of answers: the median error of position and
+orientation, the median of the 68 % radius that was reported, and the baseline's median (`tools.laser_set`);
+and how far the map's lens is from the true one, over the standard deviations that the map stores of it (root
+mean square of its parameters: 1 is right). Worst is the largest ratio of a median to the baseline's, or to
+the reported radius.
 """
 
 import tempfile
@@ -76,21 +74,18 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
     figures: dict[str, float] = {}
     ratios = []
     for kind, errors in kinds.items():
-        other = theirs["map" if kind == "map" else "asked"]
-        figures[f"{kind}_found"] = len(errors.metres)
-        for unit in ("m", "deg"):
-            mine = errors.metres if unit == "m" else errors.degrees
-            reported = errors.told_m if unit == "m" else errors.told_deg
-            baseline = other.metres if unit == "m" else other.degrees
-            middle = median(mine)
-            figures |= {
-                f"{kind}_{unit}": middle,
-                f"{kind}_reported_{unit}": median(reported),
-                f"{kind}_colmap_{unit}": median(baseline),
-            }
-            ratios.append(middle / median(reported))
-            if unit == "m":
-                ratios.append(middle / median(baseline))
+        metres, degrees = median(errors.metres), median(errors.degrees)
+        told_m, told_deg = median(errors.told_m), median(errors.told_deg)
+        colmap_m = median(theirs["map" if kind == "map" else "asked"].metres)
+        figures |= {
+            f"{kind}_found": len(errors.metres),
+            f"{kind}_m": metres,
+            f"{kind}_deg": degrees,
+            f"{kind}_reported_m": told_m,
+            f"{kind}_reported_deg": told_deg,
+            f"{kind}_colmap_m": colmap_m,
+        }
+        ratios += [metres / told_m, degrees / told_deg, metres / colmap_m]
         ratios.append(1.0 if errors.metres and len(errors.metres) == errors.wanted else float("inf"))
     figures["worst"] = float(np.nan_to_num(ratios, nan=np.inf).max())
     return figures
@@ -99,25 +94,21 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
 def lens_error(maps: Sequence[FeatureMap], truth: LaserSet) -> float:
     """Root mean square of the lens's errors over their standard deviations, of the map with most images."""
     largest = max(maps, key=lambda one: len(one.images))
-    uncertainty = LensUncertainty.of_provenance(largest.provenance)
-    seen = None if uncertainty is None else seen_by_a_map(truth.camera, uncertainty)
-    if seen is None:
-        return float("nan")
-    off = (lens_of(largest.cameras[0]) - seen[1].mean) / seen[1].sigma
+    _, prior = seen_by_a_map(truth.camera, LensUncertainty.of_provenance(largest.provenance))
+    off = (lens_of(largest.cameras[0]) - prior.mean) / prior.sigma
     return float(np.sqrt(np.mean(off**2)))
 
 
 def map_errors(maps: Sequence[FeatureMap], truth: LaserSet) -> Errors:
     """Of the cameras of placed maps, as they lie."""
     poses: dict[str, Rigid3] = {}
-    told_m, told_deg = [], []
+    stated: list[FloatArray] = []
     for one in maps:
         area = build_area([one])
         poses |= poses_in(FRAME, one)
-        for image in one.images:
-            covariance = stated_covariance(area, one, image)
-            told_m.append(error_radius(covariance[3:, 3:]))
-            told_deg.append(float(np.degrees(error_radius(covariance[:3, :3]))))
+        stated += [stated_covariance(area, one, image) for image in one.images]
+    told_m = [error_radius(covariance[3:, 3:]) for covariance in stated]
+    told_deg = [float(np.degrees(error_radius(covariance[:3, :3]))) for covariance in stated]
     return replace(errors_of(poses, truth), told_m=told_m, told_deg=told_deg, wanted=len(truth.mapped))
 
 
@@ -126,19 +117,15 @@ def stated_covariance(area: Area, feature_map: FeatureMap, image: MapImage) -> F
     pose = image.cam_from_local
     world_from_cam = np.kron(np.eye(2), pose.rotation.T)
     own = np.zeros((6, 6)) if image.covariance is None else image.covariance
-    return np.asarray(
-        world_from_cam @ own @ world_from_cam.T + placement_covariance(area, feature_map, pose.center)
-    )
+    placed = placement_covariance(area, feature_map, pose.center)
+    return np.asarray(world_from_cam @ own @ world_from_cam.T + placed)
 
 
 def camera_squares(
     feature_map: FeatureMap, frame: LocalFrame, true: Mapping[str, Rigid3]
 ) -> dict[str, list[float]]:
-    """Squared errors of a map's cameras over their covariances, of orientation and position.
-
-    Args:
-        true: cam_from_local in `frame`, by name.
-    """
+    """Squared errors of a map's cameras over their covariances, of orientation and position; `true`:
+    cam_from_local in `frame`, by name."""
     area, poses = build_area([feature_map]), poses_in(frame, feature_map)
     turn = np.kron(np.eye(2), frame.enu_from(feature_map.frame).rotation)
     result: dict[str, list[float]] = {"orientation": [], "position": []}
@@ -155,8 +142,8 @@ def answer_errors(database: Database, photos: Path, truth: LaserSet, camera: Cam
     rows = ask_poses(database, photos, truth.asked, FRAME, truth.poses, camera)
     found = [row for row in rows if row.error is not None]
     return Errors(
-        metres=[row.error.position_m for row in found if row.error is not None],
-        degrees=[row.error.angle_deg for row in found if row.error is not None],
+        metres=[row.error.position_m for row in found],
+        degrees=[row.error.angle_deg for row in found],
         told_m=[row.position_68_m for row in found],
         told_deg=[row.orientation_68_deg for row in found],
         wanted=len(truth.asked),

@@ -1,7 +1,5 @@
 """Are the bounds of answers true when lenses are not known? Draws of lenses, positions and keypoints.
 
-    python -m tools.lens_draws --draws 300 [--json FILE]
-
 Each draw is a flight over a made-up town whose lens differs from what EXIF says of it: focal length by 2 %,
 principal point by 1 % of the longer side, two radial and two tangential terms. Keypoints have half a pixel of
 noise, half of the variance of positions is shared by the flight, descriptors are made up. Everything after
@@ -58,11 +56,8 @@ _EPSG, _ORIGIN = 32632, (456_800.0, 5_429_300.0, 120.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensDraw:
-    """A draw: a town, its lens, and generator of all else.
-
-    Attributes:
-        xyz: (n, 3) points, metres. descriptors: (n, 128) of them. lens: the true one.
-    """
+    """A draw: a town's points (n, 3), metres, and their descriptors (n, 128); the true lens; and a generator
+    of all else."""
 
     xyz: FloatArray
     descriptors: NDArray[np.uint8]
@@ -104,13 +99,11 @@ def main() -> None:
     write_figures(args.json, figures)
 
 
-def drawn(seed: int, sigma_m: float) -> list[tuple[float, float]]:
+def drawn(seed: int, sigma_m: float) -> list[list[float]]:
     """Squared errors of orientation and position over their covariances of one draw's answers, of three axes
     each; none where no map is placed."""
-    scene = scene_of(seed)
-    frame = LocalFrame.from_utm(*_ORIGIN, _EPSG)
-    poses = flight(scene.rng)
-    made = _map_of(scene, poses, frame, sigma_m)
+    scene, frame = scene_of(seed), LocalFrame.from_utm(*_ORIGIN, _EPSG)
+    made = _map_of(scene, flight(scene.rng), frame, sigma_m)
     if made is None:
         return []
     indexed = [IndexedArea.of([made])]
@@ -120,15 +113,13 @@ def drawn(seed: int, sigma_m: float) -> list[tuple[float, float]]:
         height, tilt = scene.rng.uniform(25.0, 60.0), scene.rng.uniform(0.0, 30.0)
         place = [*scene.rng.uniform(-35.0, 35.0, 2), height]
         pose = look_pose(place, scene.rng.uniform(0, 360), -90.0 - tilt)
-        result = localise_features(scene.seen(pose)[1], request, indexed).result
-        if result.pose is None:
+        answer = localise_features(scene.seen(pose)[1], request, indexed).result.pose
+        if answer is None:
             continue
-        answer = result.pose
         true = pose @ frame.enu_from(answer.frame)
         turn = np.kron(np.eye(2), answer.frame.true_enu_from_enu(answer.cam_from_local.center))
         error = turn @ pose_offset(answer.cam_from_local, true)
-        orientation, position = (squared(error[k], answer.covariance[k, k]) for k in _PARTS)
-        answers.append((orientation, position))
+        answers.append([squared(error[k], answer.covariance[k, k]) for k in _PARTS])
     return answers
 
 
@@ -138,13 +129,11 @@ def scene_of(seed: int) -> LensDraw:
     ground = np.column_stack([rng.uniform(-75, 75, (2200, 2)), np.zeros(2200)])
     ground[:, 2] = 1.5 * np.sin(ground[:, 0] / 25.0) * np.cos(ground[:, 1] / 30.0)
     corners = rng.uniform(-60, 60, (14, 2))
-    houses = np.concatenate(
-        [
-            np.column_stack([c + rng.uniform(-6, 6, (60, 2)), rng.uniform(3.0, 9.0) + rng.normal(0, 0.3, 60)])
-            for c in corners
-        ]
-    )
-    xyz = np.concatenate([ground, houses])
+    houses = [
+        np.column_stack([c + rng.uniform(-6, 6, (60, 2)), rng.uniform(3.0, 9.0) + rng.normal(0, 0.3, 60)])
+        for c in corners
+    ]
+    xyz = np.concatenate([ground, *houses])
     focal = _FOCAL_PX * (1.0 + 0.02 * rng.normal())
     center = np.array([_WIDTH, _HEIGHT]) / 2 + 0.01 * _WIDTH * rng.normal(size=2)
     params = (focal, focal * (1 + 3e-4 * rng.normal()), *center, *rng.normal(0, [0.03, 0.02, 1e-3, 1e-3]))
@@ -173,12 +162,11 @@ def _map_of(scene: LensDraw, poses: Sequence[Rigid3], frame: LocalFrame, sigma_m
     centers = np.array([pose.center for pose in poses])
     part = sigma_m / np.sqrt(2.0)
     measured = centers + scene.rng.normal(0.0, part, 3) + scene.rng.normal(0.0, part, centers.shape)
-    photos = [_photo(k, frame, position, sigma_m) for k, position in enumerate(measured)]
     with tempfile.TemporaryDirectory() as scratch:
         model = _model_of(shown, measured, sigma_m, Path(scratch))
     if model is None:
         return None
-    chosen = [photos[row] for row in model.rows]
+    chosen = [_photo(row, frame, measured[row], sigma_m) for row in model.rows]
     own, _, placed = placed_by_gps(model, chosen)
     if placed.local_from_sfm is None or placed.covariance is None or placed.reason or own is None:
         return None
@@ -193,14 +181,13 @@ def _map_of(scene: LensDraw, poses: Sequence[Rigid3], frame: LocalFrame, sigma_m
         for row in model.rows
     ]
     identity = MapIdentity(map_id="draw", name="draw", source="", licence="", provenance={})
-    made = build_map(
-        model, placement, own, chosen, features, identity, MapOptions(height_datum="ellipsoidal")
-    )
+    options = MapOptions(height_datum="ellipsoidal")
+    made = build_map(model, placement, own, chosen, features, identity, options)
     return None if made is None else replace(made, status="active")
 
 
 def _photo(number: int, frame: LocalFrame, position: FloatArray, sigma_m: float) -> Photo:
-    latitude, longitude, height = frame.geodetic_from_enu(position[None])[0]
+    latitude, longitude, height = (float(v) for v in frame.geodetic_from_enu(position))
     return Photo(
         name=f"{number:02d}.jpg",
         path=Path(f"{number:02d}.jpg"),
@@ -210,9 +197,9 @@ def _photo(number: int, frame: LocalFrame, position: FloatArray, sigma_m: float)
         camera_key=_KEY,
         focal_px=_FOCAL_PX,
         gps=GeoPrior(
-            latitude_deg=float(latitude),
-            longitude_deg=float(longitude),
-            height_m=float(height),
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=height,
             sigma_horizontal_m=sigma_m,
             sigma_vertical_m=sigma_m,
         ),
@@ -250,8 +237,7 @@ def _model_of(
     output.mkdir()
     write_database(database, [(start, True)], photos, pairs)
     run_incremental(database, work, output, mapping_settings(SfmOptions(), _WIDTH))
-    known = Known(photos=photos, focal_px={1: _FOCAL_PX})
-    adjust_models(output, database, known, 0.5, AdjustOptions())
+    adjust_models(output, database, Known(photos=photos, focal_px={1: _FOCAL_PX}), 0.5, AdjustOptions())
     return max(read_models(output), key=lambda model: len(model.rows), default=None)
 
 

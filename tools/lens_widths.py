@@ -1,7 +1,5 @@
 """How wide are real lenses around what is known of them beforehand? Measures the widths of the lens priors.
 
-    python -m tools.lens_widths --photos FOLDER [FOLDER ...] --work DIR [--json FILE]
-
 Each folder of photos is ingested into a database of its own in DIR (one that is there is used). Of every lens
 of its maps the photos' own say is taken from the adjustment: its normal equations with poses and points
 eliminated, less the prior. The widths are those under which the lenses of all cameras together are most
@@ -28,7 +26,6 @@ from featuredb.geometry.camera import Camera
 from ingest.colmap.adjust import AdjustOptions
 from ingest.colmap.map_errors import terms_of_map
 from ingest.colmap.picture_shear import picture_shear
-from ingest.photos.photo import Photo
 from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
 from tools.commands import all_maps, largest_map, make, once
@@ -36,6 +33,7 @@ from tools.figures import say, study_parser, write_figures
 
 WIDTHS = tuple(field.name for field in fields(LensWidths))
 _DROP = float(chi2.ppf(0.95, 1)) / 2.0
+_OPTIONS = AdjustOptions()
 _FAR = float(np.log(100.0))  # widths are looked for up to so many times more and less than assumed
 
 
@@ -44,9 +42,8 @@ class Told:
     """What its photos say of one lens.
 
     Attributes:
-        mean: what is known of it beforehand.
+        mean: what is known of it beforehand. has_exif: whether the focal length is one of EXIF.
         information: (8, 8) and vector: (8,) of the normal equations of OPENCV's parameters, around the mean.
-        has_exif: whether the focal length is one of EXIF.
     """
 
     mean: Camera
@@ -65,26 +62,15 @@ def main() -> None:
     parser = study_parser(__doc__, "--work")
     parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
     args = parser.parse_args()
-    options = AdjustOptions()
-    databases = [_database(folder, args.work) for folder in args.photos]
-    told = [
-        one
-        for database, folder in zip(databases, args.photos, strict=True)
-        for one in lenses_of(database, folder, options)
-    ]
-    write_shears(databases)
-    if not told:
-        raise SystemExit("no lens of any map")
-    assumed = assumed_widths(options)
-    measured = measured_widths(told, assumed, options)
-    limits = {name: limits_of(told, measured, k, options) for k, name in enumerate(WIDTHS)}
-    figures = {
-        "lenses": len(told),
-        **dict(zip(WIDTHS, measured, strict=True)),
-        "inside": sum(limits[name][0] <= assumed[k] <= limits[name][1] for k, name in enumerate(WIDTHS)),
-        "assumed": dict(zip(WIDTHS, assumed, strict=True)),
-        "limits": limits,
-    }
+    databases = {folder: _database(folder, args.work) for folder in args.photos}
+    told = [one for folder, database in databases.items() for one in lenses_of(database, folder)]
+    write_shears(list(databases.values()))
+    assumed, measured = assumed_widths(), measured_widths(told)
+    limits = [limits_of(told, measured, k) for k in range(len(WIDTHS))]
+    figures: dict[str, float] = {"lenses": len(told), "inside": 0}
+    for name, width, wanted, (low, high) in zip(WIDTHS, measured, assumed, limits, strict=True):
+        say(f"{name}: {width:.2g}, between {low:.2g} and {high:.2g}; assumed {wanted:.2g}")
+        figures |= {name: width, "inside": figures["inside"] + (low <= wanted <= high)}
     write_figures(args.json, figures)
 
 
@@ -99,31 +85,29 @@ def write_shears(databases: Sequence[Path]) -> None:
         say(f"one map in twenty is above {few:.1e}, one in a thousand above {hardly:.1e}")
 
 
-def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> list[Told]:
+def lenses_of(database: Path, folder: Path) -> list[Told]:
     """What the photos of each lens of a database's maps say of it."""
-    photos = {photo.name: photo for photo in scan_folder(folder).photos}
+    focal_of = {photo.name: photo.focal_px for photo in scan_folder(folder).photos}
     told: list[Told] = []
     for feature_map in all_maps(database):
         block = whole_lens(block_of_map(feature_map))
-        focal_px = _focals(block.names, block.camera_of.tolist(), photos)
-        terms = terms_of_map(block, focal_px, None, options)
-        problem = Problem(block, terms, options.threads)
-        problem.solve(options.max_iterations, 1e-6)
-        told += _told(problem, terms, focal_px, options)
+        focal_px = _focals(block.names, block.camera_of.tolist(), focal_of)
+        terms = terms_of_map(block, focal_px, None, _OPTIONS)
+        problem = Problem(block, terms, _OPTIONS.threads)
+        problem.solve(_OPTIONS.max_iterations, 1e-6)
+        told += _told(problem, terms, focal_px)
     say(f"{folder}: {len(told)} lenses")
     return told
 
 
-def _told(
-    problem: Problem, terms: Terms, focal_px: Mapping[int, float], options: AdjustOptions
-) -> list[Told]:
+def _told(problem: Problem, terms: Terms, focal_px: Mapping[int, float]) -> list[Told]:
     """Posterior information less the prior's, of each lens by itself."""
     block, found = problem.block(), problem.marginals()
     result = []
     for c, (camera, prior) in enumerate(zip(block.cameras, terms.lenses, strict=True)):
         if prior is None or camera.model != "OPENCV" or found.lens_start[c] < 0:
             continue
-        posterior = np.linalg.inv(options.dilution * found.lens(c))
+        posterior = np.linalg.inv(_OPTIONS.dilution * found.lens(c))
         off = np.array(camera.params) - np.array(prior.mean.params)
         # Directions that photos say nothing of have what the prior says, or by its robust loss less.
         root = np.linalg.cholesky(prior.covariance)
@@ -141,27 +125,28 @@ def _told(
     return result
 
 
-def assumed_widths(options: AdjustOptions) -> FloatArray:
+def assumed_widths() -> FloatArray:
     """(5,) of `WIDTHS`."""
-    return np.array(astuple(replace(options.lens, focal_rel=options.exif_focal_rel)))
+    return np.array(astuple(replace(_OPTIONS.lens, focal_rel=_OPTIONS.exif_focal_rel)))
 
 
-def measured_widths(told: Sequence[Told], start: FloatArray, options: AdjustOptions) -> FloatArray:
+def measured_widths(told: Sequence[Told]) -> FloatArray:
     """(5,) the most likely ones."""
+    start = np.log(assumed_widths())
     best = minimize(
-        lambda logs: -log_likelihood(told, np.exp(logs), options),
-        np.log(start),
+        lambda logs: -log_likelihood(told, np.exp(logs)),
+        start,
         method="Nelder-Mead",
-        bounds=[(log - _FAR, log + _FAR) for log in np.log(start)],
+        bounds=[(log - _FAR, log + _FAR) for log in start],
         options={"maxiter": 4000},
     )
     return np.asarray(np.exp(best.x))
 
 
-def log_likelihood(told: Sequence[Told], widths: FloatArray, options: AdjustOptions) -> float:
+def log_likelihood(told: Sequence[Told], widths: FloatArray) -> float:
     """Of the photos' say under normal lenses of these widths (5,), up to a constant."""
     variance = np.tile(widths**2, (len(told), 1))
-    variance[[not one.has_exif for one in told], 0] = options.lens.focal_rel**2
+    variance[[not one.has_exif for one in told], 0] = _OPTIONS.lens.focal_rel**2
     covariance = np.einsum("nk,nkij->nij", variance, np.array([one.by_variance for one in told]))
     vector = np.array([one.vector for one in told])[:, :, None]
     whole = np.eye(8) + covariance @ np.array([one.information for one in told])
@@ -169,29 +154,28 @@ def log_likelihood(told: Sequence[Told], widths: FloatArray, options: AdjustOpti
     return 0.5 * float((vector * most_likely).sum() - np.linalg.slogdet(whole)[1].sum())
 
 
-def limits_of(
-    told: Sequence[Told], best: FloatArray, which: int, options: AdjustOptions
-) -> tuple[float, float]:
+def limits_of(told: Sequence[Told], best: FloatArray, which: int) -> tuple[float, float]:
     """Where the likelihood of one width has fallen as far as it does by chance in one of twenty cases."""
-    top = log_likelihood(told, best, options)
+    top = log_likelihood(told, best)
 
     def lack(shift: float) -> float:
         moved = best.copy()
         moved[which] *= np.exp(shift)
-        return top - log_likelihood(told, moved, options) - _DROP
+        return top - log_likelihood(told, moved) - _DROP
 
-    low, high = np.log(assumed_widths(options)[which] / best[which]) + np.array([-_FAR, _FAR])
+    low, high = np.log(assumed_widths()[which] / best[which]) + np.array([-_FAR, _FAR])
     ends = [brentq(lack, 0.0, far) if abs(far) > 0.0 and lack(far) > 0.0 else far for far in (low, high)]
     return float(best[which] * np.exp(ends[0])), float(best[which] * np.exp(ends[1]))
 
 
-def _focals(names: Sequence[str], camera_of: Sequence[int], photos: Mapping[str, Photo]) -> dict[int, float]:
+def _focals(
+    names: Sequence[str], camera_of: Sequence[int], focal_of: Mapping[str, float | None]
+) -> dict[int, float]:
     """EXIF's focal length of each camera whose photos tell one."""
     told: dict[int, set[float | None]] = {}
     for name, camera in zip(names, camera_of, strict=True):
-        told.setdefault(camera, set()).add(photos[name].focal_px)
-    only = {camera: next(iter(focals)) for camera, focals in told.items() if len(focals) == 1}
-    return {camera: focal for camera, focal in only.items() if focal is not None}
+        told.setdefault(camera, set()).add(focal_of[name])
+    return {camera: min(focals) for camera, focals in told.items() if len(focals) == 1 and None not in focals}
 
 
 def _database(folder: Path, work: Path) -> Path:

@@ -1,16 +1,11 @@
 """Peak memory and speed of `featuredb lidar add` for a scan of any size, which it makes first.
 
-    python tools/lidar_memory.py --points 100_000_000 --folder /tmp/scan
-
 The scan is an airborne one of a rolling land with houses and trees, written strip by strip as LAS 1.4, so
 that making it needs little memory, too. The command runs in a process of its own; the memory of that process
 and all its children (what they share counts once) is sampled ten times a second.
 """
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import laspy
@@ -18,9 +13,8 @@ import numpy as np
 from laspy.vlrs.known import WktCoordinateSystemVlr
 from pyproj import CRS
 
-from tools.commands import once
+from tools.commands import cost_of, once
 from tools.figures import study_parser, write_figures
-from tools.serve_process import watched_memory
 
 CHUNK = 500_000
 EPSG = 32632
@@ -71,16 +65,6 @@ def _surface(
     return height, label, value.astype(np.uint16)
 
 
-def measure(command: list[str]) -> dict[str, float]:
-    """Run a command; CPU seconds, and peak memory of its processes."""
-    process = subprocess.Popen(command, stdout=sys.stderr)
-    with watched_memory(process.pid, SAMPLE_S) as seen:
-        _, status, usage = os.wait4(process.pid, 0)
-    if os.waitstatus_to_exitcode(status) != 0:
-        raise SystemExit(f"{' '.join(command)} failed with status {os.waitstatus_to_exitcode(status)}")
-    return {"cpu_seconds": usage.ru_utime + usage.ru_stime, "peak_tree_mib": max(seen)}
-
-
 def main() -> None:
     """Make the scan unless it is there, add it to a fresh database, print what it took as JSON."""
     parser = study_parser(__doc__)
@@ -91,10 +75,11 @@ def main() -> None:
     scan = once(args.folder / f"scan-{args.points}.las", lambda path: make_scan(path, args.points))
     database = args.folder / "scans.db"
     shutil.rmtree(database, ignore_errors=True)
-    run = [sys.executable, "-m", "featuredb.cli", "lidar", "add", str(database), str(scan), "--quiet"]
-    figures = measure(run)
-    figures["points_per_cpu_second"] = args.points / figures["cpu_seconds"]
-    write_figures(args.json, {k: round(v, 1) for k, v in figures.items()})
+    words = ("lidar", "add", str(database), str(scan), "--quiet")
+    cost = cost_of("-m", "featuredb.cli", *words, sample_s=SAMPLE_S)
+    a_second = args.points / cost.seconds
+    figures = {"peak_tree_mib": cost.tree_mib, "cpu_seconds": cost.seconds, "points_per_cpu_second": a_second}
+    write_figures(args.json, figures)
 
 
 if __name__ == "__main__":

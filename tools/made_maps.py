@@ -1,7 +1,5 @@
 """What becomes of a folder of photos whose positions nobody knows: maps, and photos in them.
 
-    python -m tools.made_maps --photos FOLDER --work FOLDER [--gcp FILE]
-
 The folder is ingested into a new database.
 Prints how many photos are in the largest map, in any map, and in how many, placed or not, and
 what the placement of the first leaves between positions and the map (of --gcp: ground control points, of

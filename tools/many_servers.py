@@ -1,7 +1,5 @@
 """What several servers of one database behind a router carry, and what becomes of queries when one is killed.
 
-    python -m tools.many_servers [--json FILE]
-
 Each server is a process whose only worker takes 100 ms for a photo and does nothing else. Clients ask without
 pause: one server, two, four; then two of which one is killed (SIGKILL) in the middle.
 """
@@ -14,6 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -60,14 +59,6 @@ class _Slow:
         )
 
 
-class _Source:
-    def version(self) -> int:
-        return _Slow.snapshot
-
-    def load(self) -> ServedArea:
-        return ServedArea(localiser=_Slow(), maps=())
-
-
 def main() -> None:
     args = study_parser(__doc__).parse_args()
     rates = {}
@@ -76,7 +67,7 @@ def main() -> None:
             rates[count] = ask(router, _SECONDS)["answered"] / _SECONDS
     with servers(2) as (router, processes):
         killed = ask(router, _SECONDS, lambda: processes[0].kill())
-    figures: dict[str, Any] = {
+    figures = {
         "one_per_s": rates[1],
         "two_times": rates[2] / rates[1],
         "four_times": rates[4] / rates[1],
@@ -100,7 +91,9 @@ def servers(count: int) -> Iterator[tuple[str, list[Any]]]:
         for process in processes:
             process.start()
         try:
-            _wait_for(endpoint, count)
+            with Client(endpoint, _DATABASE, connect_timeout_s=60.0) as client:
+                while len(client.statuses()) < count:
+                    time.sleep(0.1)
             yield endpoint, processes
         finally:
             for process, (ours, theirs) in zip(processes, pipes, strict=True):
@@ -111,14 +104,9 @@ def servers(count: int) -> Iterator[tuple[str, list[Any]]]:
 
 def _serve(router: str, until_closed: Connection) -> None:
     options = ServeOptions(listen=("tcp/127.0.0.1:0",), connect=(router,), workers=1, contributions=False)
-    with Server.start(_Source(), options, _DATABASE):  # type: ignore[arg-type]
+    source = SimpleNamespace(version=lambda: 1, load=lambda: ServedArea(localiser=_Slow(), maps=()))
+    with Server.start(source, options, _DATABASE):
         until_closed.poll(None)
-
-
-def _wait_for(router: str, count: int) -> None:
-    with Client(router, _DATABASE, connect_timeout_s=60.0) as client:
-        while len(client.statuses()) < count:
-            time.sleep(0.1)
 
 
 def ask(router: str, seconds: float, in_the_middle: Callable[[], None] = lambda: None) -> Counter[str]:

@@ -1,9 +1,7 @@
 """What a map's memory buys: megabytes a square kilometre against photos answered and their errors.
 
-    python -m tools.memory_curve --photos FOLDER --work FOLDER [--json FILE]
-
 A map of all photos but every fifth is made, and one of all of them, whose poses of the others are the
-reference. Copies of the first database are thinned (`featuredb thin --cover N`), from 1,600 points that each
+reference. Copies of the first database are thinned (`featuredb thin --cover N`), from 800 points that each
 image needs to 15, and each is asked for the held-out photos over Zenoh, with nothing but the file.
 
 Bytes are those of what a server lays out for searching (`featuredb.index.segment`). The area is the convex
@@ -23,7 +21,7 @@ from tools.photo_files import photo_names
 from tools.real_photos import ask, error_figures, ingest, reference
 
 _EVERY = 5  # one photo in so many is held out
-_COVERS = (1600, 800, 400, 200, 100, 50, 25, 15)
+_COVERS = (800, 200, 50, 15)  # those that the scoreboard has
 
 
 def main() -> None:
@@ -43,16 +41,12 @@ def main() -> None:
         rows = error_figures(ask(Database.open(database), args.photos, held_out, truth))
         laid_out = segments(Database.open(database))
         size = sum(getattr(one, field.name).nbytes for one in laid_out for field in fields(one))
-        curve[f"cover_{cover or 'all'}"] = rows | {
-            "points": sum(len(one) for one in laid_out),
-            "megabytes": size / 1e6,
-            "megabytes_a_km2": size / 1e6 / km2,
-        }
+        curve[f"cover_{cover or 'all'}"] = rows | {"megabytes_a_km2": size / 1e6 / km2}
     whole = curve["cover_all"]
     for of in curve.values():
-        of["size_ratio"] = of["megabytes"] / whole["megabytes"]
+        of["size_ratio"] = of["megabytes_a_km2"] / whole["megabytes_a_km2"]
         of["kept"] = of["answered"] / max(whole["answered"], 1)
-    write_figures(args.json, {"km2": km2, **curve})
+    write_figures(args.json, curve)
 
 
 def active(database: Database) -> list[str]:

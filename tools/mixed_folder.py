@@ -1,7 +1,5 @@
 """Photos of several places and people in one folder, as a community brings them: which maps come of them.
 
-    python -m tools.mixed_folder PLACE=FOLDER... --work FOLDER [--json FILE]
-
 All photos are linked into one folder and ingested at once. Folders of the same PLACE may share a map; a map
 with photos of two places is wrong. Prints how many photos each map has and of where.
 """

@@ -1,8 +1,7 @@
 """An ortho image and a scan on one grid: where there is structure in both, and by how much they disagree.
 
-The image is sampled on a grid whose pixels are no finer than its own, or than the scan is dense. An ortho
-image is laid over the ground: what stands above leans away from where the aircraft was. So what stands is
-told from the ground, by the lowest points around, and does not count.
+The grid's pixels are no finer than the image's own, or than the scan is dense. What stands on the ground,
+which an ortho image shows leaning, is told from it by the lowest points around, and does not count.
 """
 
 from dataclasses import dataclass
@@ -67,11 +66,6 @@ class Offset:
 
     metres: Floats
     sigma: Floats
-    patches: int
-
-    def __str__(self) -> str:
-        east, north = (f"{m:+.2f} +- {s:.2f}" for m, s in zip(self.metres, self.sigma, strict=True))
-        return f"{east} m east, {north} m north, by {self.patches} patches"
 
 
 def place_of(path: Path, epsg: int, cloud: PointCloud) -> OrthoOverScan:
@@ -91,7 +85,6 @@ def place_of(path: Path, epsg: int, cloud: PointCloud) -> OrthoOverScan:
     own_m = 1.0 / float(np.linalg.norm(np.diff(in_image(middle[:, 0], middle[:, 1]), axis=0)))
     cell = max(own_m, plan_spacing_m(cloud) / _PIXELS_PER_SPACING)
     w, h = (int(n) for n in (high - low)[:2] / cell)
-    print(f"ortho: pixels of {own_m:.4f} m; grid of {w} x {h} pixels of {cell:.4f} m")
     corner = np.array([low[0], high[1]])
     pixel = np.floor((cloud.xyz[:, :2] - corner) / cell * (1.0, -1.0)).astype(int)
     inside = ((pixel >= 0) & (pixel < (w, h))).all(axis=1)
@@ -136,8 +129,12 @@ def halves_of(place: OrthoOverScan) -> dict[str, Part]:
     }
 
 
-def measured_offset(place: OrthoOverScan, part: Part, seed: int = 0) -> Offset:
-    """By how much the scan's intensities lie beside the ortho image in a part of the grid."""
+def measured_offset(place: OrthoOverScan, part: Part) -> Offset:
+    """By how much the scan's intensities lie beside the ortho image's ground in a part of the grid.
+
+    Oriented gradients of patches of the image are correlated with the scan's, the maps are summed, and draws
+    of the patches with replacement say how sure the peak is.
+    """
     usable = (place.shown & ~place.high)[part]
     size, reach = int(_PATCH_M / place.cell), int(_REACH_M / place.cell)
     image, scan = (
@@ -156,10 +153,10 @@ def measured_offset(place: OrthoOverScan, part: Part, seed: int = 0) -> Offset:
         if usable[row : row + size, column : column + size].mean() > 0.5
     ]
     each = np.nan_to_num(np.array(maps, np.float32))
-    weights = np.random.default_rng(seed).multinomial(len(each), np.full(len(each), 1 / len(each)), _DRAWS)
+    weights = np.random.default_rng(0).multinomial(len(each), np.full(len(each), 1 / len(each)), _DRAWS)
     summed = np.tensordot(np.vstack([np.ones(len(each)), weights]), each, 1).astype(np.float32)
     places = (peaks(summed)[0] - reach) * place.cell * (1.0, -1.0)
-    return Offset(metres=places[0], sigma=places[1:].std(axis=0), patches=len(each))
+    return Offset(metres=places[0], sigma=places[1:].std(axis=0))
 
 
 def _filled(picture: NDArray[Any], sigma: float) -> NDArray[np.float32]:

@@ -1,7 +1,5 @@
 """A map anchored on parts of its scan: are its cameras inside the bounds that it states?
 
-    python -m tools.part_scans --photos FOLDER --scan SCAN.laz --poses POSES.json --work WORK
-
 The photos become a map by their GPS. Copies of it are anchored (`featuredb anchor --auto`) on the whole scan,
 on each half of it and on its middle; most photos look beyond the smaller ones. Cameras are compared with
 poses that the whole scan alone gives (tools/scan_poses.py). Prints how many copies are placed, the median

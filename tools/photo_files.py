@@ -46,11 +46,8 @@ def with_place(
     *datum: str,
     **more: float,
 ) -> bytes:
-    """A JPEG with another position (3,) in its EXIF, and other XMP; the picture as it was.
-
-    Args:
-        datum, more: as `gps_directory` has them.
-    """
+    """A JPEG with another position (3,) in its EXIF, and other XMP; `datum`, `more`: as `gps_directory` has
+    them. The picture stays as it was."""
     latitude, longitude, height = (float(v) for v in frame.geodetic_from_enu(place))
     gps = gps_directory((latitude, longitude, height), *datum, error_m=error_m, **more)
     return with_app1(jpeg, with_gps(jpeg[slice(*read_header(jpeg).exif)], gps), xmp)

@@ -77,19 +77,17 @@ def visible(scan: Scan, camera: Camera, cam_from_local: Rigid3) -> tuple[NDArray
 def place_by_picks(
     database: Path, map_id: str, photos: Path, seen: Seen, scan: Scan, work: Path, seed: int
 ) -> bool:
-    """Place a map on its scan by six picks with 3 px of error in one image; whether it was placed."""
-    drawn = picks(scan, seen.camera, seen.cam_from_local, np.random.default_rng(seed), _SIGMA_PX)
-    file = write_picks(work / "picks.csv", seen.image, *drawn)
+    """Place a map on its scan by six picks in one image; whether it was placed."""
+    file = write_picks(work / "picks.csv", scan, seen, np.random.default_rng(seed))
     return anchor(database, map_id, photos, work / "anchor", "--picks", str(file), "--image", seen.image)
 
 
-def write_picks(path: Path, image: str, pixels: FloatArray, utm: FloatArray) -> Path:
-    """The file that `featuredb anchor --picks` reads."""
+def write_picks(path: Path, scan: Scan, seen: Seen, rng: np.random.Generator) -> Path:
+    """Six picks with 3 px of error, in the file that `featuredb anchor --picks` reads."""
     lines = ["image,x,y,easting,northing,height"]
-    lines += [
-        f"{image},{x:.2f},{y:.2f},{e:.3f},{n:.3f},{h:.3f}"
-        for (x, y), (e, n, h) in zip(pixels, utm, strict=True)
-    ]
+    for xy, utm in zip(*picks(scan, seen.camera, seen.cam_from_local, rng, _SIGMA_PX), strict=True):
+        words = (*(f"{value:.2f}" for value in xy), *(f"{value:.3f}" for value in utm))
+        lines.append(",".join([seen.image, *words]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 

@@ -1,7 +1,5 @@
 """Are placements by positions of any quality as uncertain as they say, and can chance place a map?
 
-    python -m tools.position_draws --work DIR [--photos FOLDER ...] [--draws 25] [--json FILE]
-
 Flights are the largest maps of the folders, made by an ordinary ingest, and five simulated ones; where a
 flight's cameras are then is the truth. Positions are made from it in the ways below, and the flight is placed
 by them as if they came from a plain receiver (4 m and 10 m). Printed by kind: how many flights have a place,
@@ -13,7 +11,7 @@ photos, those of a flight shuffled, and those of another flight.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,24 +41,20 @@ _COMMON_ROLL_DEG = 1.5  # of simulated flights, as placements assume
 class Flight:
     """Where cameras were (n, 3), metres, when (n,), seconds, in this order, and how they were turned."""
 
-    name: str
     xyz: FloatArray
     times_s: FloatArray
     cam_from_local: tuple[Rigid3, ...]
 
     def placed(self, positions: FloatArray, angles: Sequence[CameraAngles | None] = ()) -> GpsPlacement:
         """Its reconstruction by positions of a plain receiver, and by the cameras' angles."""
+        used = slice(len(positions))
         sigmas = np.tile(SIGMAS, (len(positions), 1))
-        centers = _TRUE.inverse().act(self.xyz[: len(positions)])
-        held = [
-            Rigid3(rotation=pose.rotation @ _TRUE.rotation, translation=pose.translation)
-            for pose in self.cam_from_local[: len(positions)]
-        ]
-        times_s = self.times_s[: len(positions)]
-        return place_by_gps(centers, positions, sigmas, times_s, held_of(held, angles))
+        held = [replace(pose, rotation=pose.rotation @ _TRUE.rotation) for pose in self.cam_from_local[used]]
+        centers = _TRUE.inverse().act(self.xyz[used])
+        return place_by_gps(centers, positions, sigmas, self.times_s[used], held_of(held, angles))
 
 
-def _white(sigma_m: float) -> Callable[[Flight, np.random.Generator], FloatArray]:
+def white(sigma_m: float) -> Callable[[Flight, np.random.Generator], FloatArray]:
     """Noise, and as much bias as it leaves of what a plain receiver says."""
 
     def error(flight: Flight, rng: np.random.Generator) -> FloatArray:
@@ -75,33 +69,32 @@ def _drift(flight: Flight, rng: np.random.Generator) -> FloatArray:
     share = (flight.times_s - flight.times_s[0]) / max(float(np.ptp(flight.times_s)), 1.0)
     waves = np.column_stack([share, np.sin(2.0 * np.pi * share)])
     drift = waves @ (rng.normal(0.0, [[0.9], [0.3]], (2, 3)) * [20.0, 20.0, 60.0])
-    return np.asarray(drift + _white(1.0)(flight, rng))
+    return np.asarray(drift + white(1.0)(flight, rng))
 
 
 def _outliers(flight: Flight, rng: np.random.Generator) -> FloatArray:
     """A fifth of the positions is anywhere within some hundred metres."""
     gross = rng.random((len(flight.xyz), 1)) < 0.2
-    return np.asarray(_white(2.0)(flight, rng) + gross * rng.normal(0.0, 150.0, flight.xyz.shape))
+    return np.asarray(white(2.0)(flight, rng) + gross * rng.normal(0.0, 150.0, flight.xyz.shape))
 
 
 def _one_height(flight: Flight, rng: np.random.Generator) -> FloatArray:
-    error = _white(2.0)(flight, rng)
+    error = white(2.0)(flight, rng)
     error[:, 2] = float(np.median(flight.xyz[:, 2])) + rng.normal(0.0, SIGMAS[2]) - flight.xyz[:, 2]
     return error
 
 
 def _lag(flight: Flight, rng: np.random.Generator) -> FloatArray:
     """Positions of two seconds before."""
-    speed = np.gradient(
-        flight.xyz, np.maximum.accumulate(flight.times_s + 1e-3 * np.arange(len(flight.xyz))), axis=0
-    )
-    return np.asarray(_white(1.0)(flight, rng) - 2.0 * np.clip(speed, -15.0, 15.0))
+    times_s = np.maximum.accumulate(flight.times_s + 1e-3 * np.arange(len(flight.xyz)))
+    speed = np.gradient(flight.xyz, times_s, axis=0)
+    return np.asarray(white(1.0)(flight, rng) - 2.0 * np.clip(speed, -15.0, 15.0))
 
 
 _KINDS: dict[str, Callable[[Flight, np.random.Generator], FloatArray]] = {
-    "noise of 2 m": _white(2.0),
-    "noise of 5 m": _white(5.0),
-    "noise of 15 m": _white(15.0),
+    "noise of 2 m": white(2.0),
+    "noise of 5 m": white(5.0),
+    "noise of 15 m": white(15.0),
     "drift of 20 and 60 m": _drift,
     "a bias": lambda flight, rng: rng.normal(0.0, 1.0, 3) * SIGMAS + rng.normal(0.0, 0.3, flight.xyz.shape),
     "a fifth far out": _outliers,
@@ -163,25 +156,20 @@ def squares(placed: GpsPlacement, camera: FloatArray) -> dict[str, float]:
     """Squared errors over their covariance: of a camera's position (3,), and of the orientation."""
     off = (_TRUE @ placed.local_from_sfm.inverse()).log()
     by_similarity = {"position": point_jacobian(camera[None])[0], "orientation": np.eye(7)[1:4]}
-    return {
-        part: squared(rows @ off, rows @ placed.covariance @ rows.T) for part, rows in by_similarity.items()
-    }
+    covariance = placed.covariance
+    return {part: squared(at @ off, at @ covariance @ at.T) for part, at in by_similarity.items()}
 
 
 def unrelated(flights: Sequence[Flight], chance: int) -> dict[str, float]:
-    """Positions that have nothing to do with the photos: how many flights would answer.
-
-    `chance` draws of random positions, each flight's own in another order, and those of each other flight.
-    """
+    """How many flights would answer with `chance` draws of random positions, with their own in another order,
+    and with those of each other flight."""
     found: dict[str, list[GpsPlacement]] = {"random": [], "shuffled": [], "other": []}
     for draw in range(chance):
         rng = np.random.default_rng((_SEED, 99, draw))
         flight, count = flights[draw % len(flights)], int(rng.integers(3, 9))
         rows = np.sort(rng.choice(len(flight.xyz), count, replace=False))
         held = tuple(flight.cam_from_local[row] for row in rows)
-        part = Flight(
-            name=flight.name, xyz=flight.xyz[rows], times_s=flight.times_s[rows], cam_from_local=held
-        )
+        part = Flight(xyz=flight.xyz[rows], times_s=flight.times_s[rows], cam_from_local=held)
         drawn = np.column_stack([rng.uniform(-500.0, 500.0, (count, 2)), rng.uniform(0.0, 100.0, count)])
         found["random"].append(part.placed(drawn))
     for k, flight in enumerate(flights):
@@ -200,20 +188,12 @@ def unrelated(flights: Sequence[Flight], chance: int) -> dict[str, float]:
 def real_flight(folder: Path, work: Path) -> Flight:
     """The cameras of the largest map of a folder of photos, by its own positions."""
     database = once(work / folder.parent.name, lambda path: make(path, "photos", folder))
-    largest = largest_map(database)
-    images = sorted(
-        largest.images, key=lambda image: (image.capture_time is None, image.capture_time, image.name)
-    )
-    times = [image.capture_time for image in images]
-    seconds = [
-        float(k) if t is None or times[0] is None else (t - times[0]).total_seconds()
-        for k, t in enumerate(times)
-    ]
+    images = sorted(largest_map(database).images, key=lambda image: (image.capture_time, image.name))
+    start = images[0].capture_time
     xyz: FloatArray = np.array([image.cam_from_local.center for image in images])
     return Flight(
-        name=folder.parent.name,
         xyz=xyz - xyz.mean(axis=0),
-        times_s=np.array(seconds),
+        times_s=np.array([(image.capture_time - start).total_seconds() for image in images]),
         cam_from_local=tuple(image.cam_from_local for image in images),
     )
 
@@ -221,30 +201,25 @@ def real_flight(folder: Path, work: Path) -> Flight:
 def simulated_flights(draw: int) -> list[Flight]:
     """Strips to and fro, a spiral, a walk around a house, and a winding street."""
     rng = np.random.default_rng((_SEED, 7, draw))
-    flights = []
     rolls = np.radians(rng.normal(0.0, _COMMON_ROLL_DEG, 5))
-    for name, lines, per, size in (("strips", 4, 8, 160.0), ("two strips", 2, 9, 120.0)):
+    ways = []
+    for lines, per, size in ((4, 8, 160.0), (2, 9, 120.0)):
         x = np.linspace(-0.5, 0.5, per) * size
         plan = [(v, 0.25 * size * k) for k in range(lines) for v in (x if k % 2 == 0 else x[::-1])]
-        flights.append((name, np.column_stack([plan, np.full(len(plan), 60.0)]), 4.0))
+        ways.append(np.column_stack([plan, np.full(len(plan), 60.0)]))
     turn = np.linspace(0.0, 5.0 * np.pi, 40)
-    flights.append(
-        ("spiral", np.column_stack([4 * turn * np.cos(turn), 4 * turn * np.sin(turn), 30 + 2 * turn]), 3.0)
-    )
+    ways.append(np.column_stack([4 * turn * np.cos(turn), 4 * turn * np.sin(turn), 30 + 2 * turn]))
     turn = np.linspace(0.0, 2.0 * np.pi, 24)
-    flights.append(
-        ("orbit", np.column_stack([40 * np.cos(turn), 30 * np.sin(turn), 25 + 5 * np.sin(3 * turn)]), 3.0)
-    )
+    ways.append(np.column_stack([40 * np.cos(turn), 30 * np.sin(turn), 25 + 5 * np.sin(3 * turn)]))
     along = np.linspace(0.0, 300.0, 50)
-    flights.append(("street", np.column_stack([along, 40 * np.sin(along / 40), 2 + 0.02 * along]), 4.0))
+    ways.append(np.column_stack([along, 40 * np.sin(along / 40), 2 + 0.02 * along]))
     return [
         Flight(
-            name=name,
             xyz=xyz + rng.normal(0.0, 0.5, xyz.shape),
-            times_s=np.asarray(step * np.arange(len(xyz), dtype=np.float64)),
-            cam_from_local=tuple(_held(xyz, k, rolls[row], rng) for k in range(len(xyz))),
+            times_s=step_s * np.arange(len(xyz), dtype=np.float64),
+            cam_from_local=tuple(_held(xyz, k, roll, rng) for k in range(len(xyz))),
         )
-        for row, (name, xyz, step) in enumerate(flights)
+        for xyz, step_s, roll in zip(ways, (4.0, 4.0, 3.0, 3.0, 4.0), rolls, strict=True)
     ]
 
 
@@ -252,8 +227,7 @@ def _held(xyz: FloatArray, k: int, common_roll: float, rng: np.random.Generator)
     """A camera that looks ahead and down, level but for two degrees and what all have in common."""
     ahead = xyz[min(k + 1, len(xyz) - 1)] - xyz[max(k - 1, 0)]
     heading, roll = np.arctan2(ahead[1], ahead[0]), rng.normal(common_roll, np.radians(2.0))
-    held = look_pose(np.zeros(3), 90.0 - float(np.degrees(heading)), -50.0, -float(np.degrees(roll)))
-    return Rigid3(rotation=held.rotation, translation=np.zeros(3))
+    return look_pose(np.zeros(3), 90.0 - float(np.degrees(heading)), -50.0, -float(np.degrees(roll)))
 
 
 if __name__ == "__main__":

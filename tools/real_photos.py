@@ -1,8 +1,5 @@
 """Real photos end to end: some are held out, localised over Zenoh, and compared with a map of all photos.
 
-    python -m tools.real_photos --photos FOLDER --work FOLDER --held-out DJI_0020.JPG DJI_0025.JPG
-    python -m tools.real_photos --photos FOLDER --work FOLDER --as-film
-
 1. `featuredb ingest photos` takes all photos but the held-out ones, in a process and a database of its own.
 2. The same takes all photos, into another database: what its map says of the held-out ones is the reference.
    Both maps are placed by the photos' GPS, so the differences hold the placements' as well.
@@ -89,12 +86,8 @@ def as_film(photos: Path, names: Sequence[str], work: Path, whole: FeatureMap) -
         if name in moved:
             off.append(pose_difference(part.frame, moved[name], pose.epsg, pose.utm, pose.cam_from_utm_xyzw))
             say(f"{name}: {off[-1]}")
-    counts = {
-        "frames": len(names),
-        "lost": len(names) - len(poses),
-        "unknown": len(poses.keys() - moved.keys()),
-    }
-    return counts | spread([e.position_m for e in off], [e.angle_deg for e in off])
+    unknown, lost = len(poses.keys() - moved.keys()), len(names) - len(poses)
+    return {"frames": len(names), "lost": lost, "unknown": unknown, **spread_of(off)}
 
 
 def ingest(database: Path, photos: Path, exclude: Sequence[str], *more: str) -> dict[str, float]:
@@ -105,22 +98,16 @@ def ingest(database: Path, photos: Path, exclude: Sequence[str], *more: str) -> 
 
 
 def reference(database: Path) -> FeatureMap:
-    """The map with most images."""
+    """The active map with most images."""
     snapshot = Database.open(database).snapshot()
     maps = [m for m in snapshot.maps() if m.status == "active"]
     return snapshot.load_map(max(maps, key=lambda m: m.images).map_id)
 
 
 def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMap) -> list[HeldOutRow]:
-    """Localise the photos over Zenoh and compare with their poses in the reference map.
-
-    Those that the reference map does not have are left out: nothing tells where they were taken.
-    """
+    """Localise the photos over Zenoh and compare with their poses in the reference map, if it has them."""
     poses = {image.name: image.cam_from_local for image in truth.images}
-    known = [name for name in names if name in poses]
-    if left_out := [name for name in names if name not in poses]:
-        say(f"not in the reference map, so left out: {', '.join(left_out)}")
-    return ask_poses(database, photos, known, truth.frame, poses)
+    return ask_poses(database, photos, [name for name in names if name in poses], truth.frame, poses)
 
 
 def ask_poses(
@@ -131,19 +118,10 @@ def ask_poses(
     poses: Mapping[str, Rigid3],
     camera: CameraRequest | None = None,
 ) -> list[HeldOutRow]:
-    """Localise the photos over Zenoh and compare with poses `cam_from_local` in a frame.
-
-    Args:
-        camera: sent with each photo.
-    """
-    missing = [name for name in names if name not in poses]
-    if missing:
-        raise SystemExit(f"without a reference pose, so there is nothing to compare with: {missing}")
-    rows = []
-    with (
-        start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
-        Client(server.endpoints[0]) as client,
-    ):
+    """Localise the photos over Zenoh, each sent with `camera`, and compare with poses `cam_from_local` in a
+    frame."""
+    rows, options = [], ServeOptions(listen=("tcp/127.0.0.1:0",))
+    with start_server(database, options) as server, Client(server.endpoints[0]) as client:
         for name in names:
             reply = client.localise(photos / name, camera=camera, timeout_s=60.0)
             rows.append(_row(name, reply, frame, poses[name]))
@@ -153,9 +131,9 @@ def ask_poses(
 
 def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3) -> HeldOutRow:
     error, nan = None, float("nan")
-    if reply.utm is not None:
-        utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
-        error = pose_difference(frame, pose, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
+    if (at := reply.utm) is not None:
+        utm = (at.easting, at.northing, at.height)
+        error = pose_difference(frame, pose, at.epsg, utm, at.cam_from_utm_xyzw)
     return HeldOutRow(
         name=name,
         reason=reply.reason or "",
@@ -168,8 +146,12 @@ def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3) -> He
 def error_figures(rows: Sequence[HeldOutRow]) -> dict[str, float]:
     """How many photos were answered, and the errors of the answers."""
     errors = [row.error for row in rows if row.error is not None]
-    counts = {"asked": len(rows), "answered": len(errors)}
-    return counts | spread([e.position_m for e in errors], [e.angle_deg for e in errors])
+    return {"asked": len(rows), "answered": len(errors), **spread_of(errors)}
+
+
+def spread_of(errors: Sequence[PoseError]) -> dict[str, float]:
+    """Medians and largest of errors."""
+    return spread([e.position_m for e in errors], [e.angle_deg for e in errors])
 
 
 if __name__ == "__main__":

@@ -14,16 +14,15 @@ import sys
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parent.parent
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--publish", action="store_true", help="tag and publish; default: a dry run")
-    publish = parser.parse_args(argv).publish
+    publish = parser.parse_args().publish
     version = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]["version"]
     problems = _problems(version)
     for problem in problems:
@@ -76,9 +75,8 @@ def _tried(wheel: Path, environment: Path, version: str) -> None:
     program, database = str(environment / "bin" / "featuredb"), str(environment / "maps.db")
     if version not in _run(program, "--version"):
         raise SystemExit(f"expected version {version}")
-    _run(
-        str(environment / "bin" / "python"), "-I", "-c", "import featuredb; featuredb.open; featuredb.Camera"
-    )
+    python = str(environment / "bin" / "python")
+    _run(python, "-I", "-c", "import featuredb; featuredb.open; featuredb.Camera")
     for words in (("init", database), ("maps", database), ("verify", database), ("completion", "bash")):
         _run(program, *words)
     sys.stdout.write("the wheel works without extras\n")

@@ -1,33 +1,30 @@
 """Photos of a rolling shutter, placed by positions alone: what answers, and is it inside its bounds?
 
-    python -m tools.rolling_shutter --work FOLDER [--inputs FOLDER]
-
 1. One frame a second of the simulated films, smooth and jerky, whose rows are read out over 30 ms.
 2. Each flight is ingested as photos with EXIF, by a drone's receiver (1.5 m that wander, 0.3 s late) and by
    RTK (2 cm, stated).
 3. Each map that answers is compared with the truth: the squared errors of position and of orientation of its
    cameras by their covariance, at the median camera, against 99.9 %.
-
 """
 
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2
 
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.camera.photograph import Device, Shot, exif_of, jpeg_bytes
 from featuredb.simworld.world import WorldOptions, in_order, town_of
 from featuredb.store import Database
 from tools.commands import featuredb, once
-from tools.figures import pose_offset, say, squared, study_parser, write_figures
+from tools.figures import say, study_parser, write_figures
+from tools.laser_truth import camera_squares
 from tools.photo_files import with_place
 from tools.worlds.film_world import (
-    Exposure,
     FilmOptions,
     FlightPath,
     FlightStyle,
@@ -46,29 +43,25 @@ _OUTSIDE = float(chi2.ppf(0.999, 3))
 
 def main() -> None:
     args = study_parser(__doc__, "--work", "--inputs").parse_args()
-    figures = {"flights": 0, "active": 0, "outside": 0, "held_back": 0, "unnamed": 0}
-    worst = 0.0
-    for style in _STYLES:
-        for seed in _SEEDS:
-            film = film_options(style, seed)
-            pictures = drawn(film, args.inputs / f"rolling-{style}-{seed}-{_PHOTOS}")
-            for receiver in ("plain", "rtk"):
-                name = f"{style}-{seed}-{receiver}"
-                photos = tagged(film, pictures, receiver == "rtk", args.work / name)
-                words = ("ingest", "photos", str(args.work / f"{name}.db"), str(photos))
-                told = featuredb(*words, "--max-features", "4000", "--quiet", refusals=(1,))
-                maps = Database.open(args.work / f"{name}.db").snapshot()
-                active = [m for m in maps.maps() if m.status == "active"]
-                squares = [normalised(film, maps.load_map(m.map_id)) for m in active]
-                figures["flights"] += 1
-                figures["active"] += bool(active)
-                figures["outside"] += sum(max(one) > _OUTSIDE for one in squares)
-                figures["held_back"] += not active
-                figures["unnamed"] += "rolling shutter" not in told.stdout + told.stderr
-                worst = max([worst, *(max(one) for one in squares)])
-                words = ", ".join(f"position {a:.1f} and orientation {b:.1f}" for a, b in squares)
-                say(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}")
-    write_figures(args.json, figures | {"worst_squared": worst})
+    figures = {"flights": 0, "active": 0, "outside": 0, "held_back": 0, "unnamed": 0, "worst_squared": 0.0}
+    for style, seed in product(_STYLES, _SEEDS):
+        film = film_options(style, seed)
+        pictures = drawn(film, args.inputs / f"rolling-{style}-{seed}-{_PHOTOS}")
+        for receiver in ("plain", "rtk"):
+            name = f"{style}-{seed}-{receiver}"
+            photos = tagged(film, pictures, receiver == "rtk", args.work / name)
+            words = ("ingest", "photos", str(args.work / f"{name}.db"), str(photos))
+            told = featuredb(*words, "--max-features", "4000", "--quiet", refusals=(1,))
+            maps = Database.open(args.work / f"{name}.db").snapshot()
+            squares = [normalised(film, maps.load_map(m.map_id)) for m in maps.maps() if m.status == "active"]
+            figures["flights"] += 1
+            figures["active"] += bool(squares)
+            figures["outside"] += sum(max(one) > _OUTSIDE for one in squares)
+            figures["held_back"] += not squares
+            figures["unnamed"] += "rolling shutter" not in told.stdout + told.stderr
+            figures["worst_squared"] = max([figures["worst_squared"], *map(max, squares)])
+            say(f"{name}: squared errors of position and orientation ({_OUTSIDE:.1f} is 99.9 %): {squares}")
+    write_figures(args.json, figures)
 
 
 def film_options(style: FlightStyle, seed: int) -> FilmOptions:
@@ -80,7 +73,8 @@ def film_options(style: FlightStyle, seed: int) -> FilmOptions:
         rate_hz=1.0,
         width=960,
         height=540,
-        exposure=Exposure(samples=2, readout_s=_READOUT_S),
+        samples=2,
+        readout_s=_READOUT_S,
     )
 
 
@@ -128,20 +122,10 @@ def tagged(film: FilmOptions, pictures: Path, rtk: bool, folder: Path) -> Path:
 
 def normalised(film: FilmOptions, feature_map: FeatureMap) -> tuple[float, float]:
     """Squared errors of position and orientation by their covariance, at the median camera."""
-    scene_from_map = town_of(film.world).frame.enu_from(feature_map.frame)
-    placement = feature_map.placement.covariance
-    squares: list[tuple[float, float]] = []
-    for image in feature_map.images:
-        pose = image.cam_from_local
-        true = pose_at(film, film.time_s(int(Path(image.name).stem))) @ scene_from_map
-        own = image.covariance if image.covariance is not None else np.zeros((6, 6))
-        turn, at = pose.rotation.T, point_jacobian(pose.center)
-        center = at @ placement @ at.T + turn @ own[3:, 3:] @ turn.T
-        angle = placement[1:4, 1:4] + turn @ own[:3, :3] @ turn.T
-        off = pose_offset(true, pose)
-        squares.append((squared(off[3:], center), squared(off[:3], angle)))
-    position, orientation = np.median(squares, axis=0)
-    return float(position), float(orientation)
+    frames = {image.name: int(Path(image.name).stem) for image in feature_map.images}
+    true = {name: pose_at(film, film.time_s(frame)) for name, frame in frames.items()}
+    squares = camera_squares(feature_map, town_of(film.world).frame, true)
+    return float(np.median(squares["position"])), float(np.median(squares["orientation"]))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Positions good to 2 cm, said in each way that makers and tables have: believed, and how right is the map?
 
-    python -m tools.rtk_placed --work FOLDER [--inputs FOLDER]
-
 1. A flight over the simulated town; its photos get positions with 2 cm of noise per axis, the same for all.
 2. Each way of saying so is ingested by itself: XMP of DJI, of Autel, of Pix4D (which senseFly and Parrot
    write), EXIF's error of positioning, a table's columns, geo.txt. Beside XMP, EXIF says 5 m.
@@ -22,8 +20,8 @@ from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.world import TrueImage, Truth, World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database
 from tools.anchor_simworld import camera_errors
-from tools.commands import featuredb, first_map, once
-from tools.figures import study_parser, write_figures
+from tools.commands import featuredb, first_map, largest_map, once
+from tools.figures import median, say, study_parser, write_figures
 from tools.photo_files import copied, position_table, with_place
 from tools.worlds.sights import SeenPlaces
 
@@ -53,15 +51,17 @@ def main() -> None:
     images = world.truth.group("drone")
     places = np.array([image.cam_from_local.center for image in images])
     places = places + rng.normal(0.0, _SIGMA_M, places.shape)
-    figures: dict[str, float] = {}
+    found = []
     for way in _WAYS:
         source = said(world, places, way, args.work / way)
-        figures |= ingested(args.work / f"{way}.db", source, world.truth, way)
-    figures |= with_control(world, options, places, args.work, rng)
-    figures["worst_m"] = max(figures[f"{way}_m"] for way in _WAYS)
-    figures["worst_sigma_m"] = max(figures[f"{way}_sigma_m"] for way in _WAYS)
-    figures["active"] = sum(figures[f"{way}_active"] for way in _WAYS)
-    write_figures(args.json, figures)
+        found.append(ingested(args.work / f"{way}.db", source, world.truth))
+        say(f"{way}: {found[-1]}")
+    figures = {
+        "worst_m": max(one["off_m"] for one in found),
+        "worst_sigma_m": max(one["sigma_m"] for one in found),
+        "active": sum(one["active"] for one in found),
+    }
+    write_figures(args.json, figures | with_control(world, options, places, args.work, rng))
 
 
 def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
@@ -78,33 +78,26 @@ def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
             (folder / name).write_bytes(told)
         return folder
     copied(world.folder / "drone", names, folder, strip=True)
-    geodetic = np.array([world.truth.frame.geodetic_from_enu(place) for place in places])
-    rows = list(zip(names, geodetic.tolist(), strict=True))
+    rows = list(zip(names, world.truth.frame.geodetic_from_enu(places).tolist(), strict=True))
     if way == "table":
         return position_table(folder, [(name, *place, _SIGMA_M, _SIGMA_M) for name, place in rows])
-    lines = ["EPSG:4326"]
-    lines += [
-        f"{name} {lon:.10f} {lat:.10f} {up:.4f} 0 0 0 {_SIGMA_M} {_SIGMA_M}" for name, (lat, lon, up) in rows
-    ]
+    angles_and_sigmas = f"0 0 0 {_SIGMA_M} {_SIGMA_M}"
+    lines = [f"{name} {lon:.10f} {lat:.10f} {up:.4f} {angles_and_sigmas}" for name, (lat, lon, up) in rows]
     file = folder / "geo.txt"
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    file.write_text("\n".join(["EPSG:4326", *lines]) + "\n", encoding="utf-8")
     return file
 
 
-def ingested(database: Path, source: Path, truth: Truth, way: str) -> dict[str, float]:
-    """Whether a map answers, how many photos it has, and how far off their cameras are (median, m)."""
+def ingested(database: Path, source: Path, truth: Truth) -> dict[str, float]:
+    """Whether a map answers, how far off its cameras are (median), and to what its place is known."""
     trust = ("--trust-geotags",) if source.is_file() else ()
     featuredb("ingest", "photos", str(database), str(source), *trust, *_MOST)
-    snapshot = Database.open(database).snapshot()
-    placed = max(snapshot.maps(), key=lambda one: one.images)
-    feature_map = snapshot.load_map(placed.map_id)
-    metres, _ = camera_errors(feature_map, truth)
-    evidence = feature_map.placement.evidence
-    sigma_m = float(np.hypot(evidence["bias_sigma_m"][0], evidence["noise_m"][0]))
+    made = largest_map(database)
+    evidence = made.placement.evidence
     return {
-        f"{way}_m": float(np.median(metres)),
-        f"{way}_active": int(placed.status == "active"),
-        f"{way}_sigma_m": sigma_m,
+        "off_m": float(np.median(camera_errors(made, truth)[0])),
+        "active": int(made.status == "active"),
+        "sigma_m": float(np.hypot(evidence["bias_sigma_m"][0], evidence["noise_m"][0])),
     }
 
 
@@ -118,16 +111,11 @@ def with_control(
     featuredb("register", str(work / "dji.db"), right.map_id, "--gcp", str(gcp))
     high = said(world, places + np.array([0.0, 0.0, _DATUM_M]), "dji", work / "high")
     featuredb("ingest", "photos", str(work / "high.db"), str(high), "--gcp", str(gcp), *_MOST)
-    notes = {}
-    for name in ("dji", "high"):
-        evidence = first_map(Database.open(work / f"{name}.db")).placement.evidence
-        notes[name] = [note for note in evidence["notes"] if "GPS" in note]
-    told = [re.search(r"heights are ([0-9.]+) m above", note) for note in notes["high"]]
+    placed = [first_map(Database.open(work / f"{name}.db")).placement for name in ("dji", "high")]
+    notes = [[note for note in one.evidence["notes"] if "GPS" in note] for one in placed]
+    told = [re.search(r"heights are ([0-9.]+) m above", note) for note in notes[1]]
     metres = [float(one[1]) for one in told if one is not None]
-    return {
-        "told_m": metres[0] if metres else float("nan"),
-        "told_wrongly": len(notes["dji"]) + len(notes["high"]) - len(metres),
-    }
+    return {"told_m": median(metres[:1]), "told_wrongly": len(notes[0]) + len(notes[1]) - len(metres)}
 
 
 def control_text(world: World, options: WorldOptions, rng: np.random.Generator) -> str:
@@ -151,12 +139,10 @@ def control_text(world: World, options: WorldOptions, rng: np.random.Generator) 
 def marked(image: TrueImage, depth: np.ndarray, spot: FloatArray) -> FloatArray | None:
     """Where a photo shows a spot (2,), None where it does not."""
     inside = image.cam_from_local.act(spot)
-    if inside[2] <= 0:
+    (xy,) = image.camera.project(inside)
+    if not ((xy >= 10) & (xy < [image.camera.width - 10, image.camera.height - 10])).all():  # or behind: NaN
         return None
-    (xy,) = image.camera.project(inside[None])
-    column, row = int(xy[0]), int(xy[1])
-    if not (10 <= column < image.camera.width - 10 and 10 <= row < image.camera.height - 10):
-        return None
+    column, row = xy.astype(int)
     return xy if abs(float(depth[row, column]) - inside[2]) < 0.1 else None
 
 

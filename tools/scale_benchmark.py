@@ -1,7 +1,5 @@
 """What a large database costs: its start, a small commit, a query; beside a small one of the same maps.
 
-    python -m tools.scale_benchmark DB:FOLDER [DB:FOLDER ...] --work FOLDER [--points N] [--json FILE]
-
 Each DB holds one map of the photos in FOLDER. Some of its photos are taken out of the map and asked for.
 Copies of the maps are laid out as one city until they have N described points. A copy has its map's shape at
 another place, and its descriptors with their cells in another order: real ones, which are neither the map's
@@ -20,6 +18,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -86,7 +85,7 @@ def main() -> None:
             figures[f"{size}_first_start_s"] = pool.submit(first_start, path, queries[0]).result()
             measured = pool.submit(measure, path, queries).result()
         figures |= {f"{size}_{name}": value for name, value in measured.items()}
-    for name in ("first_start_s", "start_s", "commit_s", "with_prior_ms", "without_ms"):
+    for name in ("start_s", "commit_s", "with_prior_ms", "without_ms"):
         figures[f"times_{name.rsplit('_', 1)[0]}"] = figures[f"large_{name}"] / figures[f"small_{name}"]
     more = figures["large_points"] - figures["small_points"]
     for kind in ("resident_bytes", "anonymous_bytes"):
@@ -99,14 +98,12 @@ def source_of(database: str, folder: str) -> MapSource:
     snapshot = Database.open(database).snapshot()
     whole = snapshot.load_map(max(snapshot.maps(), key=lambda m: m.images).map_id)
     images = sorted(whole.images, key=lambda image: image.name)
-    at = np.linspace(0, len(images) - 1, _HELD_OUT + 2).round().astype(int)[1:-1]
-    asked = [images[i] for i in at]
+    asked = [images[i] for i in np.linspace(0, len(images) - 1, _HELD_OUT + 2).round().astype(int)[1:-1]]
     rest = only_images(whole, {i.image_id for i in whole.images} - {i.image_id for i in asked})
     rest = replace(rest, images=tuple(replace(image, gps=None) for image in rest.images))
-    options = LocaliseOptions()
     photos = []
     for image in asked:
-        features = extract(decode_gray(Path(folder) / image.name), options.extractor)
+        features = extract(decode_gray(Path(folder) / image.name), LocaliseOptions().extractor)
         photos.append((features, whole.cameras[image.camera_id], image.cam_from_local.center))
     return MapSource(rest, photos)
 
@@ -153,60 +150,51 @@ def city(path: Path, sources: Sequence[MapSource], points: int) -> list[Query]:
 
 def first_start(path: Path, query: Query) -> float:
     """Seconds to the first answer where nothing has been laid out yet; in a new process."""
-    _own_cache(path)
-    began = time.perf_counter()
-    ask(Localiser.open(Database.open(str(path))), query, prior=True)
-    return time.perf_counter() - began
+    return _started(path, query)[1]
 
 
-def _own_cache(path: Path) -> None:
+def _started(path: Path, query: Query) -> tuple[Localiser, float]:
+    """A localiser on one thread, with a cache of its own, and seconds until it has answered."""
     use_threads(1)
     os.environ["XDG_CACHE_HOME"] = f"{path}-cache"
+    began = time.perf_counter()
+    localiser = Localiser.open(Database.open(str(path)))
+    ask(localiser, query, prior=True)
+    return localiser, time.perf_counter() - began
 
 
 def measure(path: Path, queries: Sequence[Query]) -> dict[str, float]:
-    """Of one database, in a process that has done nothing before: seconds, milliseconds of a query (median),
-    shares of queries, bytes after them."""
-    _own_cache(path)
-    began = time.perf_counter()
-    database = Database.open(str(path))
-    localiser = Localiser.open(database)
-    ask(localiser, queries[0], prior=True)
-    start_s = time.perf_counter() - began
+    """Of one database, in a new process: seconds, milliseconds of a query (median), shares, then bytes."""
+    localiser, start_s = _started(path, queries[0])
     points = sum(len(a.area.points) for a in localiser.areas)
     times: dict[bool, list[float]] = {True: [], False: []}
-    answered = {True: 0, False: 0}
-    wrong = 0
-    for query in queries:
-        for prior in (True, False):
-            began = time.perf_counter()
-            error = ask(localiser, query, prior=prior)
-            times[prior].append(time.perf_counter() - began)
-            answered[prior] += error is not None and error < _RIGHT_M
-            wrong += error is not None and error >= _RIGHT_M
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for query, prior in product(queries, (True, False)):
+        began = time.perf_counter()
+        error = ask(localiser, query, prior=prior)
+        times[prior].append(time.perf_counter() - began)
+        errors[prior] += [] if error is None else [error]
+    right = {prior: sum(error < _RIGHT_M for error in of) for prior, of in errors.items()}
     gc.collect()
-    resident, anonymous = _memory("VmRSS"), _memory("RssAnon")
-    commit_s = _commit(database, localiser, queries[0])
     return {
         "points": points,
         "start_s": start_s,
-        "commit_s": commit_s,
         "with_prior_ms": 1e3 * median(times[True]),
         "without_ms": 1e3 * median(times[False]),
-        "answered_with_prior": answered[True] / len(queries),
-        "answered_without": answered[False] / len(queries),
-        "wrong": wrong,
-        "resident_bytes": resident,
-        "anonymous_bytes": anonymous,
+        "answered_with_prior": right[True] / len(queries),
+        "answered_without": right[False] / len(queries),
+        "wrong": sum(map(len, errors.values())) - sum(right.values()),
+        "resident_bytes": _memory("VmRSS"),
+        "anonymous_bytes": _memory("RssAnon"),
+        "commit_s": _commit(Database.open(str(path)), localiser, queries[0]),  # memory was read before
     }
 
 
 def _commit(database: Database, localiser: Localiser, query: Query) -> float:
     """Seconds from a commit of a small map until a query is answered from a database that has it."""
     like = first_map(database)
-    small = replace(
-        only_points(like, np.arange(len(like.points)) < _COMMITTED), map_id="committed", name="committed"
-    )
+    few = only_points(like, np.arange(len(like.points)) < _COMMITTED)
+    small = replace(few, map_id="committed", name="committed")
     began = time.perf_counter()
     database.commit_map(small)
     opened = Localiser.open(database, previous=localiser)

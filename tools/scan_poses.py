@@ -23,6 +23,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from tools.figures import say, study_parser
+from tools.photo_files import photo_names
 from tools.scan_to_photo import (
     Lens,
     PosedPicture,
@@ -66,39 +67,26 @@ def scan_truth(args: argparse.Namespace) -> ScanTruth:
     if not args.poses.exists():
         write_poses(args.scan, args.photos, args.poses)
     document = json.loads(args.poses.read_text(encoding="utf-8"))
-    easting, northing, height = document["origin"]
     epsg = int(document["crs"].removeprefix("EPSG:"))
-    cameras = {
-        key: Camera(model=one["model"], width=one["width"], height=one["height"], params=tuple(one["params"]))
-        for key, one in document["cameras"].items()
-    }
-    return ScanTruth(
-        frame=LocalFrame.from_utm(easting, northing, height, epsg),
-        epsg=epsg,
-        cameras={name: cameras[entry["camera"]] for name, entry in document["poses"].items()},
-        poses={
-            name: Rigid3(
-                rotation=np.array(entry["cam_from_local_rotation"]),
-                translation=np.array(entry["cam_from_local_translation"]),
-            )
-            for name, entry in document["poses"].items()
-        },
-    )
+    cameras: dict[str, Camera] = {}
+    poses: dict[str, Rigid3] = {}
+    for name, entry in document["poses"].items():
+        lens = document["cameras"][entry["camera"]]
+        cameras[name] = Camera(**{key: lens[key] for key in ("model", "width", "height", "params")})
+        rotation, translation = entry["cam_from_local_rotation"], entry["cam_from_local_translation"]
+        poses[name] = Rigid3(rotation=rotation, translation=translation)
+    frame = LocalFrame.from_utm(*document["origin"], epsg)
+    return ScanTruth(frame=frame, epsg=epsg, cameras=cameras, poses=poses)
 
 
-def write_poses(scan: Path, photos: Path, path: Path) -> None:
-    """Register the photos of a folder, and write what `register` says."""
+def write_poses(scan_path: Path, folder: Path, target: Path) -> None:
+    """Write the poses of all photos of a folder that register, with the cameras and the accuracy."""
     cv2.setNumThreads(1)
-    path.write_text(json.dumps(register(scan, photos), indent=1) + "\n")
-
-
-def register(scan_path: Path, folder: Path) -> dict[str, Any]:
-    """Poses of all photos of a folder that register, with the cameras and the accuracy, JSON-able."""
     scan = read_scan(scan_path)
     raster = nadir_raster(scan)
     features = raster_features(raster)
     of_camera: dict[str, list[PosedPicture]] = {}
-    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png")):
+    for path in (folder / name for name in photo_names(folder)):
         gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         pose = first_pose(gray, _start(gray), raster, features)
         say(f"{path.name}: {'no pose' if pose is None else 'first pose'}")
@@ -107,33 +95,31 @@ def register(scan_path: Path, folder: Path) -> dict[str, Any]:
             of_camera.setdefault(key, []).append(PosedPicture(path.name, gray, pose))
     cameras, poses = {}, {}
     for key, photos in of_camera.items():
-        if len(photos) < 2:
-            raise SystemExit(
-                f"{folder}: only {photos[0].name} of the camera {key!r} registers to {scan_path}"
-            )
         lens = _start(photos[0].gray)
         for free in _ROUNDS:
             photos = [correspond(photo, lens, scan) for photo in photos]
             photos, lens = adjust(photos, lens, free)
-            say(f"{sum(len(p.world) for p in photos)} correspondences, focal length {lens.f:.1f} px")
+            say(f"{sum(len(p.world) for p in photos)} correspondences, focal {lens.values[0]:.1f} px")
         cameras[key] = _camera(photos, lens)
         poses |= {photo.name: _pose(photo, key) for photo in photos}
-    return {"crs": scan.crs, "origin": list(scan.origin), "cameras": cameras, "poses": poses}
+    document = {"crs": scan.crs, "origin": list(scan.origin), "cameras": cameras, "poses": poses}
+    target.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def _start(gray: NDArray[np.uint8]) -> Lens:
     """Any focal length will do for a start: over nearly flat ground the height takes it up."""
     height, width = gray.shape
-    return Lens(width, height, 0.6 * width, width / 2 - 0.5, height / 2 - 0.5)
+    return Lens(width, height, np.array([0.6 * width, width / 2 - 0.5, height / 2 - 0.5, 0, 0, 0, 0]))
 
 
 def _camera(photos: list[PosedPicture], lens: Lens) -> dict[str, Any]:
+    f, cx, cy, *distortion = lens.values.tolist()
     return {
         "model": "OPENCV",
         "width": lens.width,
         "height": lens.height,
         # COLMAP's pixels: centre of the top-left pixel at (0.5, 0.5).
-        "params": [lens.f, lens.f, lens.cx + 0.5, lens.cy + 0.5, lens.k1, lens.k2, lens.p1, lens.p2],
+        "params": [f, f, cx + 0.5, cy + 0.5, *distortion],
         "halves_of_photos": halves_of_photos(photos, lens),
     }
 
@@ -158,7 +144,7 @@ def halves_of_photos(photos: list[PosedPicture], lens: Lens) -> dict[str, float]
         **dict(zip(("east_m", "north_m", "up_m"), np.median(np.abs(shifts), axis=0).tolist(), strict=True)),
         "position_m": float(np.median(np.linalg.norm(shifts, axis=1))),
         "rotation_deg": float(np.median(turns)),
-        "focal_px": abs(lenses[0].f - lenses[1].f),
+        "focal_px": abs(lenses[0].values[0] - lenses[1].values[0]),
     }
 
 

@@ -33,32 +33,24 @@ class ColouredScan:
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """OpenCV's pinhole with k1, k2, p1, p2; OpenCV's pixels: centre of the top-left pixel at (0, 0)."""
+    """OpenCV's pinhole: f, cx, cy, k1, k2, p1, p2; its pixels: centre of the top-left pixel at (0, 0)."""
 
     width: int
     height: int
-    f: float
-    cx: float
-    cy: float
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-
-    def values(self) -> Floats:
-        """What `adjust` estimates, in its order."""
-        return np.array([self.f, self.cx, self.cy, self.k1, self.k2, self.p1, self.p2])
+    values: Floats
 
     def matrix(self) -> Floats:
-        return np.array([[self.f, 0, self.cx], [0, self.f, self.cy], [0, 0, 1]])
+        f, cx, cy = self.values[:3]
+        return np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
 
     def distortion(self) -> Floats:
-        return np.array([self.k1, self.k2, self.p1, self.p2])
+        return self.values[3:]
 
     def scaled(self, width: int) -> "Lens":
         s = width / self.width
-        centre = ((self.cx + 0.5) * s - 0.5, (self.cy + 0.5) * s - 0.5)
-        return Lens(width, round(self.height * s), self.f * s, *centre, *self.values()[3:].tolist())
+        centre = (self.values[1:3] + 0.5) * s - 0.5
+        values = np.concatenate([self.values[:1] * s, centre, self.values[3:]])
+        return Lens(width, round(self.height * s), values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +65,6 @@ class PosedPicture:
 def read_scan(path: Path) -> ColouredScan:
     las = laspy.read(path)
     crs = las.header.parse_crs()
-    if crs is None:
-        raise SystemExit(f"{path}: the file names no CRS")
     grid = np.column_stack([las.x, las.y, las.z]).astype(np.float64)
     origin = tuple(np.round(np.median(grid, axis=0)).tolist())
     rgb = np.column_stack([las.red, las.green, las.blue])
@@ -121,41 +111,25 @@ def first_pose(photo: NDArray[np.uint8], lens: Lens, raster: tuple, scan_feature
     """Pose by SIFT against the raster and RANSAC PnP, or None."""
     picture, heights, low = raster
     keypoints, descriptors = scan_features
-    small = cv2.resize(
-        photo,
-        (RENDER_WIDTH // 2, round(photo.shape[0] * RENDER_WIDTH / 2 / photo.shape[1])),
-        interpolation=cv2.INTER_AREA,
-    )
+    size = (RENDER_WIDTH // 2, round(photo.shape[0] * RENDER_WIDTH / 2 / photo.shape[1]))
+    small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
     found, described = cv2.SIFT_create(6000).detectAndCompute(small, None)
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     pairs = [m for m, n in matcher.knnMatch(described, descriptors, k=2) if m.distance < 0.8 * n.distance]
     scale = photo.shape[1] / small.shape[1]
     pixels = np.array([found[m.queryIdx].pt for m in pairs]) * scale
     at = np.array([keypoints[m.trainIdx].pt for m in pairs])
-    filled = cv2.inpaint(
-        np.nan_to_num(heights, nan=0).astype(np.float32),
-        np.isnan(heights).astype(np.uint8),
-        3,
-        cv2.INPAINT_NS,
-    )
+    known, empty = np.nan_to_num(heights, nan=0).astype(np.float32), np.isnan(heights).astype(np.uint8)
+    filled = cv2.inpaint(known, empty, 3, cv2.INPAINT_NS)
     up = filled[at[:, 1].round().astype(int), at[:, 0].round().astype(int)]
-    world = np.column_stack(
-        [low[0] + (at[:, 0] + 0.5) * RASTER_M, low[1] + (picture.shape[0] - at[:, 1] - 0.5) * RASTER_M, up]
-    )
-    done, rvec, tvec, inliers = cv2.solvePnPRansac(
-        world,
-        pixels,
-        lens.matrix(),
-        lens.distortion(),
-        iterationsCount=20000,
-        reprojectionError=20.0,
-        flags=cv2.SOLVEPNP_AP3P,
-    )
+    east, north = at[:, 0] + 0.5, picture.shape[0] - at[:, 1] - 0.5
+    world = np.column_stack([low[0] + east * RASTER_M, low[1] + north * RASTER_M, up])
+    camera = lens.matrix(), lens.distortion()
+    search = {"iterationsCount": 20000, "reprojectionError": 20.0, "flags": cv2.SOLVEPNP_AP3P}
+    done, rvec, tvec, inliers = cv2.solvePnPRansac(world, pixels, *camera, **search)
     if not done or len(inliers) < 30:
         return None
-    rvec, tvec = cv2.solvePnPRefineLM(
-        world[inliers[:, 0]], pixels[inliers[:, 0]], lens.matrix(), lens.distortion(), rvec, tvec
-    )
+    rvec, tvec = cv2.solvePnPRefineLM(world[inliers[:, 0]], pixels[inliers[:, 0]], *camera, rvec, tvec)
     return np.concatenate([rvec.ravel(), tvec.ravel()])
 
 
@@ -168,19 +142,17 @@ def render(
     projected = np.full((len(scan.xyz), 2), -1e6)
     front = camera_points[:, 2] > 1.0
     # Beyond the picture's corners the lens polynomial may fold back: keep to what is within 1.3 of them.
+    f, *corner = lens.values[:3]
     slope = np.hypot(*(camera_points[front, :2] / camera_points[front, 2:]).T)
-    front[np.flatnonzero(front)[slope > 1.3 * np.hypot(lens.cx, lens.cy) / lens.f]] = False
-    projected[front] = cv2.projectPoints(
-        scan.xyz[front], pose[:3], pose[3:], lens.matrix(), lens.distortion()
-    )[0][:, 0]
+    front[np.flatnonzero(front)[slope > 1.3 * np.hypot(*corner) / f]] = False
+    camera = lens.matrix(), lens.distortion()
+    projected[front] = cv2.projectPoints(scan.xyz[front], pose[:3], pose[3:], *camera)[0][:, 0]
     depth = camera_points[:, 2]
-    inside = (
-        front & (projected > -5).all(axis=1) & (projected < (lens.width + 4, lens.height + 4)).all(axis=1)
-    )
-    rows = np.flatnonzero(inside)
+    size = (lens.width + 4, lens.height + 4)
+    rows = np.flatnonzero(front & (projected > -5).all(axis=1) & (projected < size).all(axis=1))
     rows = rows[np.argsort(-depth[rows])]  # far first, near written last
     index = np.full((lens.height, lens.width), -1, np.int64)
-    radius = max(1, round(0.5 * lens.f / float(np.median(depth[rows])) * 0.12))
+    radius = max(1, round(0.5 * f / float(np.median(depth[rows])) * 0.12))
     nearest = np.full(index.shape, np.inf)
     offsets = [(i, j) for i in range(-radius, radius + 1) for j in range(-radius, radius + 1)]
     offsets.sort(key=lambda o: -(o[0] ** 2 + o[1] ** 2))  # a point's own pixel wins over its neighbours'
@@ -206,13 +178,10 @@ def correspond(photo: PosedPicture, lens: Lens, scan: ColouredScan) -> PosedPict
     target = cv2.resize(photo.gray, (small.width, small.height), interpolation=cv2.INTER_AREA)
     target = cv2.GaussianBlur(target, (0, 0), 1.5)  # the scan's own sharpness
     solid = cv2.erode((index >= 0).astype(np.uint8), np.ones((25, 25), np.uint8))
-    filled = cv2.GaussianBlur(
-        cv2.inpaint(picture, (index < 0).astype(np.uint8), 3, cv2.INPAINT_TELEA), (0, 0), 1
-    )
+    filled = cv2.inpaint(picture, (index < 0).astype(np.uint8), 3, cv2.INPAINT_TELEA)
+    filled = cv2.GaussianBlur(filled, (0, 0), 1)
     a, b = _equal_contrast(filled), _equal_contrast(target)
     corners = cv2.goodFeaturesToTrack(a, 6000, 0.005, 7, mask=solid, blockSize=7)
-    if corners is None:
-        return replace(photo, world=np.zeros((0, 3)), pixels=np.zeros((0, 2)))
     settings = {
         "winSize": (31, 31),
         "maxLevel": 2,
@@ -239,14 +208,11 @@ def _equal_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def adjust(photos: list[PosedPicture], lens: Lens, free: tuple[int, ...]) -> tuple[list[PosedPicture], Lens]:
     """Poses of all photos and the lens parameters `free` (0 f, 1 cx, 2 cy, 3 k1, 4 k2, 5 p1, 6 p2) from all
     correspondences, robustly (Geman-McClure at three times the spread)."""
-    count = len(photos)
-    poses = np.array([p.pose for p in photos])
-    values = lens.values()
-    k = len(free)
-    size = 6 * count + k
+    count, poses, values = len(photos), np.array([p.pose for p in photos]), lens.values.copy()
+    size = 6 * count + len(free)
     for _ in range(30):
         normal, gradient = np.zeros((size, size)), np.zeros(size)
-        current = Lens(lens.width, lens.height, *values.tolist())
+        current = replace(lens, values=values)
         results = [_linearise(p, pose, current) for p, pose in zip(photos, poses, strict=True)]
         sigma = 1.4826 * float(np.median(np.concatenate([np.abs(r).ravel() for r, _ in results])))
         for i, (residual, jacobian) in enumerate(results):
@@ -262,7 +228,7 @@ def adjust(photos: list[PosedPicture], lens: Lens, free: tuple[int, ...]) -> tup
         if np.abs(step[: 6 * count].reshape(-1, 6)[:, 3:]).max() < 1e-4:
             break
     moved = [replace(p, pose=pose) for p, pose in zip(photos, poses, strict=True)]
-    return moved, Lens(lens.width, lens.height, *values.tolist())
+    return moved, replace(lens, values=values)
 
 
 def _linearise(photo: PosedPicture, pose: Floats, lens: Lens) -> tuple[Floats, Floats]:

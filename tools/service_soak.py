@@ -1,7 +1,5 @@
 """A server under mixed load for long: queries, commits, reloads, kills, hostile messages.
 
-    python -m tools.service_soak DB PHOTOS [--minutes 10]
-
 Honest clients ask as in tools/attacks_benchmark.py; meanwhile maps are committed and retired, workers killed,
 and truncated photos and broken messages sent, in turn. Every answer must be that of the quiet server, every
 question must have an answer or an error of the server's, and the memory must stay as it was.

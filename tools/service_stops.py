@@ -1,7 +1,5 @@
 """Does a server that is stopped in the middle of its load end, cleanly and in time?
 
-    python -m tools.service_stops DB PHOTOS
-
 Each time a server process is started, asked by several clients at once, and told to stop by SIGTERM at a
 random moment. Clean is: exit code 0 within the time that queries in hand may take, nothing left of its
 processes, and an answer or an error for each question that it had taken.
@@ -9,17 +7,17 @@ processes, and an answer or an error for each question that it had taken.
 
 import random
 import subprocess
-import sys
 import threading
 import time
-from dataclasses import dataclass, replace
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from featuredb.errors import ServiceError
 from reloc.client import Client
 from reloc.client.connection import TIMEOUT
-from tools.figures import write_figures
-from tools.serve_process import ServeProcess, children
+from tools.figures import say, write_figures
+from tools.serve_process import ServeProcess, beside, children
 from tools.service_world import photos_of, service_parser
 
 _STOPS, _CLIENTS = 200, 4
@@ -28,16 +26,15 @@ _LOG_LINES = 200  # a trace of every thread has some hundred
 _LATEST_S = 2.0  # the last moment of the signal, after the first question
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stopped:
+class Stopped(NamedTuple):
     """One stop. `codes`: what clients heard, "" for an answer. left: processes that outlived it.
     log: the last lines that the server wrote."""
 
     seconds: float
     exit_code: int | None
-    codes: tuple[str, ...]
+    codes: list[str]
     left: int
-    log: tuple[str, ...]
+    log: list[str]
 
     @property
     def clean(self) -> bool:
@@ -61,25 +58,18 @@ def stopped_under_load(database: Path, photo: bytes, after_s: float) -> Stopped:
         except ServiceError as error:
             codes.append(error.code)
 
-    threads = [threading.Thread(target=ask) for _ in range(_CLIENTS)]
-    for thread in threads:
-        thread.start()
-    asking.wait(_STOP_S)
-    time.sleep(after_s)
-    start = time.monotonic()
-    try:
-        code: int | None = server.stop(timeout_s=_STOP_S)
-    except subprocess.TimeoutExpired:
-        code = None
-    seconds = time.monotonic() - start
-    for thread in threads:
-        thread.join()
+    code: int | None = None
+    with beside([threading.Thread(target=ask) for _ in range(_CLIENTS)], threading.Event()):
+        asking.wait(_STOP_S)
+        time.sleep(after_s)
+        start = time.monotonic()
+        with suppress(subprocess.TimeoutExpired):
+            code = server.stop(timeout_s=_STOP_S)
+        seconds = time.monotonic() - start
     end = time.monotonic() + 5.0
     while (left := sum(Path(f"/proc/{pid}").exists() for pid in tree)) and time.monotonic() < end:
         time.sleep(0.05)
-    return Stopped(
-        seconds=seconds, exit_code=code, codes=tuple(codes), left=left, log=tuple(server.errors[-_LOG_LINES:])
-    )
+    return Stopped(seconds, code, codes, left, server.errors[-_LOG_LINES:])
 
 
 def main() -> None:
@@ -90,8 +80,7 @@ def main() -> None:
     for number in range(_STOPS):
         found.append(stopped_under_load(args.db, photo, rng.uniform(0.0, _LATEST_S)))
         if not found[-1].clean:
-            sys.stdout.write(f"stop {number}: {replace(found[-1], log=())}\n{''.join(found[-1].log)}")
-            sys.stdout.flush()
+            say(f"stop {number}: {found[-1]._replace(log=[])}\n{''.join(found[-1].log)}")
     figures = {
         "stops": len(found),
         "clean": sum(one.clean for one in found),

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from featuredb.store import Database
 from reloc.authority import Authority
 from reloc.client import Client, LocaliseReply
 from reloc.service.session import bind_free_port
+from tools.commands import first_map
 from tools.figures import study_parser
 from tools.serve_process import CommandProcess, ServeProcess, beside
 
@@ -60,13 +62,11 @@ def _wait_for(process: subprocess.Popen[bytes], port: int) -> None:
     end = time.monotonic() + _START_S
     while True:
         try:
-            socket.create_connection(("127.0.0.1", port), 1.0).close()
+            return socket.create_connection(("127.0.0.1", port), 1.0).close()
         except OSError as error:
             if process.poll() is not None or time.monotonic() > end:
                 raise RuntimeError(f"haproxy does not listen on 127.0.0.1:{port}") from error
             time.sleep(0.05)
-        else:
-            return
 
 
 def service_parser(doc: str | None) -> argparse.ArgumentParser:
@@ -79,10 +79,8 @@ def service_parser(doc: str | None) -> argparse.ArgumentParser:
 
 def enlarged(database: Database, points: int) -> list[str]:
     """Copies of the oldest map, each beside the last, until the database has so many points; all map ids."""
-    snapshot = database.snapshot()
-    summary = snapshot.maps()[0]
-    original = snapshot.load_map(summary.map_id)
-    database.commit_maps([moved(original, k) for k in range(1, -(-points // summary.points))])
+    original = first_map(database)
+    database.commit_maps([moved(original, k) for k in range(1, -(-points // len(original.points)))])
     return [m.map_id for m in database.snapshot().maps()]
 
 
@@ -109,14 +107,11 @@ def copied_map(source: FeatureMap, frame: LocalFrame, number: int, map_id: str) 
 
 
 def cell_order(copy: int) -> NDArray[np.int64]:
-    """(128,) another order of a descriptor's 4 x 4 cells; the first is its own.
-
-    Corners, edges and inner cells change places among themselves: they have different weights in SIFT.
-    """
+    """(128,) another order of a descriptor's 4 x 4 cells, the first its own; corners, edges and inner cells,
+    of different weights in SIFT, change places among themselves."""
     rng = np.random.default_rng(copy)
     cells = np.arange(16)
-    row, column = np.divmod(cells, 4)
-    inner = ((row % 3) > 0).astype(np.int64) + ((column % 3) > 0)
+    inner = sum((at % 3 > 0).astype(np.int64) for at in np.divmod(cells, 4))
     if copy:
         for kind in range(3):
             alike = np.flatnonzero(inner == kind)
@@ -144,11 +139,7 @@ def free_port() -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """A server with keys, and a gateway before it.
-
-    Attributes:
-        keys: folder of the authority. port: of the proxy before the server.
-    """
+    """A server with keys, and a gateway before it; the authority's folder, and the port of the proxy."""
 
     server: ServeProcess
     gateway: CommandProcess
@@ -167,26 +158,12 @@ def running_service(database: Path, work: Path) -> Iterator[Service]:
     for name in (*HONEST, ATTACKER, WEB):
         authority.add_client(name)
     with ExitStack() as stack:
-        server = ServeProcess(
-            database,
-            "--config",
-            keys / "server.json5",
-            "--listen",
-            f"tls/127.0.0.1:{behind}",
-            "--deadline",
-            DEADLINE_S,
-        )
+        words = ("--config", keys / "server.json5", "--listen", f"tls/127.0.0.1:{behind}")
+        server = ServeProcess(database, *words, "--deadline", DEADLINE_S)
         stack.callback(server.stop)
         stack.enter_context(proxied(port, behind))
-        gateway = CommandProcess(
-            "gateway",
-            "--config",
-            keys / f"clients/{WEB}.json5",
-            "--port",
-            free_port(),
-            "--timeout",
-            DEADLINE_S,
-        )
+        words = ("--config", keys / f"clients/{WEB}.json5", "--port", free_port())
+        gateway = CommandProcess("gateway", *words, "--timeout", DEADLINE_S)
         stack.callback(gateway.stop)
         yield Service(server=server, gateway=gateway, keys=keys, port=port)
 
@@ -197,8 +174,7 @@ class Heard:
 
     Attributes:
         seconds: of each question, failed ones as long as they may take. failures: codes.
-        same: of each answer, whether it is the place of the first one to the same question, or none where
-            that had none.
+        same: of each answer, whether it is that of the first one to the same question.
     """
 
     seconds: list[float] = field(default_factory=list)
@@ -228,11 +204,8 @@ def same_place(reply: LocaliseReply, expected: LocaliseReply) -> bool:
 def first_answers(service: Service, photos: Sequence[bytes]) -> list[LocaliseReply]:
     """What each photo is answered when nobody else asks: with its position, then without."""
     with Client(config_path=service.config(HONEST[0])) as client:
-        return [
-            client.localise(photo, exif_prior=prior, timeout_s=60.0)
-            for prior in (True, False)
-            for photo in photos
-        ]
+        asked = product((True, False), photos)
+        return [client.localise(photo, exif_prior=prior, timeout_s=60.0) for prior, photo in asked]
 
 
 @contextmanager
@@ -249,9 +222,8 @@ def honest_clients(
         which = number % len(expected)
         start = time.monotonic()
         try:
-            reply = client.localise(
-                photos[which % len(photos)], exif_prior=which < len(photos), timeout_s=DEADLINE_S
-            )
+            photo, prior = photos[which % len(photos)], which < len(photos)
+            reply = client.localise(photo, exif_prior=prior, timeout_s=DEADLINE_S)
         except ServiceError as error:
             heard.failed(error.code)
         else:

@@ -1,12 +1,9 @@
 """All positions of a flight shifted by 50 km together: placed, and told where a scan or a map contradicts.
 
-    python -m tools.shifted_positions --photos FOLDER --scan FILE --work FOLDER
-
 1. Every second photo becomes a map by its own positions; the others become one by a table of theirs that are
    50 km too far east. This ingest has to say so, and to keep that map in quarantine.
 2. `featuredb anchor` of the second map on the scan of the place, and `featuredb grow` with the second half
    contributed to a database of the first: both have to say the distance, too.
-
 """
 
 import re
@@ -41,14 +38,15 @@ def main() -> None:
     featuredb("lidar", "add", str(database), str(args.scan))
     away = args.work / "anchor"
     words = ("anchor", str(database), second.map_id, "--photos", str(shifted), "--out", str(away), "--auto")
-    figures: dict[str, float | None] = {
+    anchor_km = told_km(*words, "--quiet")
+    contribute(Database.open(grown), [contribution(shifted / name) for name in names[1::2]])
+    figures = {
         "quarantined": int(second.status == "quarantined"),
         "photos": second.images,
         "ingest_km": ingest_km,
-        "anchor_km": told_km(*words, "--quiet"),
+        "anchor_km": anchor_km,
+        "grow_km": told_km("grow", str(grown)),
     }
-    contribute(Database.open(grown), [contribution(shifted / name) for name in names[1::2]])
-    figures["grow_km"] = told_km("grow", str(grown))
     write_figures(args.json, figures)
 
 
@@ -79,8 +77,6 @@ def contribution(photo: Path) -> Contribution:
         client_id="shifted",
         received_at=datetime.now(UTC),
         request={"prior": prior},
-        answer={"status": "not_localised"},
-        snapshot=1,
     )
 
 

@@ -1,16 +1,12 @@
 """Our SIFT beside OpenCV's: time, and matches of neighbouring photos with ours, with OpenCV's, and across.
 
-    python -m tools.sift_against_opencv FOLDER... [--json FILE]
-
 Of each folder's photos, by name, every eighth and the one after it. Both extractors have the same thresholds
 and number of features, and choose them alike; matches are mutual and pass a ratio test of 0.85; inliers are
 those of a fundamental matrix to one pixel of the shrunk photos. Times are of one thread, without decoding.
 """
 
 import time
-from dataclasses import dataclass
-from statistics import median
-from typing import Any
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,14 +17,14 @@ from featuredb.features.extractor import ExtractorOptions, extract, rootsift_8bi
 from featuredb.features.scale_space import LAYERS, SIGMA
 from featuredb.features.shrink import shrunk
 from featuredb.index.nearest import nearest
-from tools.figures import study_parser, write_figures
+from tools.figures import median, study_parser, write_figures
+from tools.photo_files import photo_names
 
 _EVERY, _RATIO, _TOLERANCE_PX = 8, 0.85, 1.0
 _SIDE_PX, _FEATURES = 1000, 3000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TimedFeatures:
+class TimedFeatures(NamedTuple):
     """Places (n, 2) in pixels of the shrunk photo, descriptors (n, 128), and seconds that they took."""
 
     xy: NDArray[np.float32]
@@ -40,27 +36,27 @@ def main() -> None:
     args = study_parser(__doc__, "folders").parse_args()
     options = ExtractorOptions(first_octave_px=2 * _SIDE_PX, max_features=_FEATURES, oversample=1.25)
     cv2.setNumThreads(1)
-    counts = {"ours": 0, "opencv": 0, "across": 0}
+    own = opencv = across = 0
     ours_s, opencv_s = [], []
     for folder in args.folders:
-        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".jpg", ".jpeg"))
-        for first, second in zip(paths[::_EVERY], paths[1::_EVERY], strict=False):
-            photos = [shrunk(decode_gray(path.read_bytes()), _SIDE_PX) for path in (first, second)]
+        names = photo_names(folder)
+        for pair in zip(names[::_EVERY], names[1::_EVERY], strict=False):
+            photos = [shrunk(decode_gray(folder / name), _SIDE_PX) for name in pair]
             ours = [by_us(photo, options) for photo in photos]
             theirs = [by_opencv(photo, options) for photo in photos]
-            counts["ours"] += inliers(ours[0], ours[1])
-            counts["opencv"] += inliers(theirs[0], theirs[1])
-            counts["across"] += inliers(ours[0], theirs[1])
+            own += inliers(*ours)
+            opencv += inliers(*theirs)
+            across += inliers(ours[0], theirs[1])
             ours_s += [one.seconds for one in ours]
             opencv_s += [one.seconds for one in theirs]
-    ratios = [mine / other for mine, other in zip(ours_s, opencv_s, strict=True)]
+    ratios = np.divide(ours_s, opencv_s)
     figures = {
         "photos": len(ratios),
         "time_ratio": median(ratios),
         "ours_ms": 1e3 * median(ours_s),
-        "opencv_inliers": counts["opencv"],
-        "inliers_ratio": counts["ours"] / counts["opencv"],
-        "across_ratio": counts["across"] / counts["opencv"],
+        "opencv_inliers": opencv,
+        "inliers_ratio": own / opencv,
+        "across_ratio": across / opencv,
     }
     write_figures(args.json, figures)
 
@@ -68,13 +64,12 @@ def main() -> None:
 def by_us(photo: NDArray[np.uint8], options: ExtractorOptions) -> TimedFeatures:
     start = time.thread_time()
     found = extract(photo, options)
-    return TimedFeatures(xy=found.xy, descriptors=found.descriptors, seconds=time.thread_time() - start)
+    return TimedFeatures(found.xy, found.descriptors, time.thread_time() - start)
 
 
 def by_opencv(photo: NDArray[np.uint8], options: ExtractorOptions) -> TimedFeatures:
     start = time.thread_time()
-    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
-    sift = create(
+    sift = cv2.SIFT_create(
         int(options.oversample * options.max_features),
         LAYERS,
         options.contrast_threshold,
@@ -87,9 +82,7 @@ def by_opencv(photo: NDArray[np.uint8], options: ExtractorOptions) -> TimedFeatu
     response = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
     rows = spread_strongest(xy, response, photo.shape[1], photo.shape[0], options.max_features)
     descriptors = rootsift_8bit(raw[rows])
-    return TimedFeatures(
-        xy=xy[rows] + np.float32(0.5), descriptors=descriptors, seconds=time.thread_time() - start
-    )
+    return TimedFeatures(xy[rows] + np.float32(0.5), descriptors, time.thread_time() - start)
 
 
 def inliers(first: TimedFeatures, second: TimedFeatures) -> int:

@@ -1,7 +1,5 @@
 """How good are the answers on the simulated world, and do their reported uncertainties mean something?
 
-    python -m tools.simulated_evaluation --work DIR [--seed 1]
-
 Makes a world whose drone photos carry exact positions, ingests them (both are kept in DIR and reused), asks
 for every held-out photo and every negative, and compares with the truth:
 
@@ -24,7 +22,6 @@ from featuredb.geometry.error_radius import error_radius
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.negatives import NEGATIVE_KINDS
 from featuredb.simworld.scoring import PoseError, pose_difference, summarise
 from featuredb.simworld.world import World
 from featuredb.store import Database
@@ -38,7 +35,6 @@ from tools.growth_common import answer_of
 
 _DRAWS = 300  # of placements
 _SIGMA_M = 0.02  # of each axis, as the demo ingests exact positions
-_WRONG_M = 5.0
 
 
 class Asked(NamedTuple):
@@ -56,8 +52,11 @@ def main() -> None:
     if not database.snapshot().maps():
         ingest_world(world, database, args.work / "report")
     localiser = Localiser.open(database)
-    photos = {"drone": world.images("queries"), "street": world.images("street")}
-    photos |= {kind: world.negatives(kind) for kind in NEGATIVE_KINDS}
+    photos = {
+        "drone": world.images("queries"),
+        "street": world.images("street"),
+        "negatives": world.negatives(),
+    }
     asked = {group: [ask(world, localiser, path) for path in paths] for group, paths in photos.items()}
     answers = [one for one in asked["drone"] if one.true]
     (area,) = (indexed.area for indexed in localiser.areas)
@@ -79,20 +78,20 @@ def ask(world: World, localiser: Localiser, path: Path) -> Asked:
 
 def flat_figures(asked: dict[str, list[Asked]]) -> dict[str, float]:
     """Answers to held-out drone photos with their errors; answers where there should be none."""
-    drone = summarise([a.error for a in asked["drone"]])
-    negatives = [a for kind in NEGATIVE_KINDS for a in asked[kind]]
-    everything = [a for those in asked.values() for a in those]
+    groups = {group: summarise([a.error for a in of]) for group, of in asked.items()}
+    drone = groups["drone"]
+    answered = {group: sum(a.pose is not None for a in of) for group, of in asked.items()}
     return {
         "asked": len(asked["drone"]),
-        "answered": sum(a.pose is not None for a in asked["drone"]),
+        "answered": answered["drone"],
         "within": drone.within,
         "median_m": drone.position_m[0],
         "median_deg": drone.angle_deg[0],
-        "wrong": sum(a.error is not None and a.error.position_m > _WRONG_M for a in everything),
-        "negatives": len(negatives),
-        "negatives_answered": sum(a.pose is not None for a in negatives),
+        "wrong": sum(of.wrong for of in groups.values()),
+        "negatives": len(asked["negatives"]),
+        "negatives_answered": answered["negatives"],
         "street": len(asked["street"]),
-        "street_answered": sum(a.pose is not None for a in asked["street"]),
+        "street_answered": answered["street"],
     }
 
 
@@ -111,13 +110,12 @@ def inside_over_placements(
     for one in answers:
         center = one.pose.cam_from_local.center
         back = np.kron(np.eye(2), one.pose.frame.true_enu_from_enu(center).T)
-        own = back @ one.pose.covariance @ back.T
-        measured.append(own - placement_covariance(area, feature_map, center))
+        measured.append(back @ one.pose.covariance @ back.T - placement_covariance(area, feature_map, center))
     inside = []
     for _ in range(_DRAWS):
         positions = true_centers + rng.normal(0.0, part, 3) + rng.normal(0.0, part, true_centers.shape)
         again = place_by_gps(centers_sfm, positions, np.full(positions.shape, _SIGMA_M))
-        if again.reason is not None or again.local_from_sfm is None or again.covariance is None:
+        if again.reason is not None:
             continue  # a gate refuses it
         told = replace(placement, local_from_sfm=again.local_from_sfm, covariance=again.covariance)
         moved_map = replace(feature_map, placement=told)
@@ -127,14 +125,10 @@ def inside_over_placements(
             moved = motion.act_on_pose(one.pose.cam_from_local)
             covariance = turn @ own @ turn.T + placement_covariance(area, moved_map, moved.center)
             error = pose_offset(moved, one.true)
-            inside.append(
-                (
-                    np.hypot(*error[3:5]) <= error_radius(covariance[3:5, 3:5]),
-                    np.linalg.norm(error[:3]) <= error_radius(covariance[:3, :3]),
-                )
-            )
-    horizontal, orientation = np.mean(inside, axis=0)
-    return {"inside_horizontal": float(horizontal), "inside_orientation": float(orientation)}
+            parts = (slice(3, 5), slice(0, 3))  # horizontal, orientation
+            inside.append([np.linalg.norm(error[k]) <= error_radius(covariance[k, k]) for k in parts])
+    names = ("inside_horizontal", "inside_orientation")
+    return dict(zip(names, np.mean(inside, axis=0).tolist(), strict=True))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Maps of few photos: are their cameras inside the bounds that they state?
 
-    python -m tools.small_sets [FOLDER ...] --photos FOLDER --scan SCAN.laz --poses POSES.json --work WORK
-
 Runs of four, six and eight photos, in the order of their names, each become a database of their own: of
 --photos with the positions of their EXIF, against poses that the scan alone gives (tools/scan_poses.py);
 of FOLDERs with laser truth (`tools.laser_set`) with exact positions. Prints of the photos in placed maps how

@@ -1,12 +1,9 @@
 """Maps of street photos placed on the scan of their town by its outlines: how many, how right?
 
-    python -m tools.street_on_scan --work DIR [--inputs DIR]
-
-Of each town, 60 photos by ten people, a third of them with geotags of 10 m (`tools.worlds.street_people`),
+Of each town, 60 photos by ten people, a third of them with geotags of 10 m (`tools.worlds.community`),
 are ingested, and each map of ten photos and more is placed by `featuredb anchor --near --auto` on the town's
 scan, what that leaves as a map without a place likewise; then the same on the scan of another town, where
-nothing may be placed.
-What is found of a town is kept in DIR.
+nothing may be placed. What is found of a town is kept in DIR.
 """
 
 from functools import partial
@@ -17,14 +14,14 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from featuredb.geometry.sim3 import point_jacobian
+from featuredb.geometry.sim3 import place_covariance
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.world import Truth, read_truth
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, make, newest_copy, once
 from tools.figures import kept, median, squared, study_parser, write_figures
-from tools.worlds.album import TABLE_FILE
-from tools.worlds.community import StreetOptions, write_street_album
+from tools.worlds.album import TABLE_FILE, write_album
+from tools.worlds.community import StreetOptions, street_album
 from tools.worlds.scan_world import make_scan_world
 
 _TOWNS = tuple(range(306, 316))
@@ -40,19 +37,15 @@ def main() -> None:
     inputs, work = args.inputs, args.work
     towns = [kept(work / f"town-{seed}.json", partial(_town, seed, inputs, work)) for seed in _TOWNS]
     here = [one for town in towns for one in town["here"]]
-    placed = [one for one in here if one["off"]]
-    off = np.array([pair for one in placed for pair in one["off"]]).reshape(-1, 3)
+    off = np.array([of for one in here for of in one["off"]]).reshape(-1, 3)
     photos = sum(one["photos"] for one in here)
     right = int(((off[:, 0] <= _RIGHT_M) & (off[:, 1] <= _RIGHT_DEG)).sum())
     write_figures(
         args.json,
         {
-            "towns": len(towns),
             "maps": len(here),
             "photos": photos,
-            "maps_placed": len(placed),
             "placed": len(off),
-            "right": right,
             "right_share": right / max(photos, 1),
             "outside": int((off[:, 2] > _OUTSIDE_M).sum()),
             "median_m": median(off[:, 0]),
@@ -66,7 +59,8 @@ def main() -> None:
 def _town(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
     """What is found of one town."""
     world = make_scan_world(inputs, seed)
-    album = write_street_album(inputs / f"street-{seed}", StreetOptions(seed=seed))
+    options = StreetOptions(seed=seed)
+    album = write_album(inputs / f"street-{seed}", options, partial(street_album, options))
     made = once(work / f"made-{seed}", lambda making: make(making, "photos", album / TABLE_FILE))
     return {
         kind: _placed(made, scan, album, work)
@@ -102,13 +96,13 @@ def _off(placed: FeatureMap, truth: Truth) -> list[tuple[float, float, float]]:
     here = truth.frame.enu_from(placed.frame)
     found = []
     for image in placed.images:
-        true = truth.images[image.name].cam_from_local @ here
-        off = image.cam_from_local.center - true.center
-        jacobian = point_jacobian(image.cam_from_local.center)
-        square = squared(off, jacobian @ placed.placement.covariance @ jacobian.T)
+        pose, true = image.cam_from_local, truth.images[image.name].cam_from_local @ here
+        off = pose.center - true.center
+        square = squared(off, place_covariance(placed.placement.covariance, pose.center))
         metres = float(np.linalg.norm(off))
-        bound = metres * float(np.sqrt(_BOUND / square)) if square > 0.0 else np.inf
-        found.append((metres, image.cam_from_local.angle_to_deg(true), max(metres - bound, 0.0)))
+        found.append(
+            (metres, pose.angle_to_deg(true), metres * max(1.0 - float(np.sqrt(_BOUND / square)), 0.0))
+        )
     return found
 
 

@@ -1,12 +1,9 @@
 """Single strips of photos, placed by positions with the cameras' angles and without: are the bounds true?
 
-    python -m tools.strip_draws --photos FOLDER --scan SCAN.laz --poses POSES.json [--draws 200] [--json FILE]
-
 Real strips are runs of five or six photos along one line of the folder, with the positions and angles of
 their EXIF and XMP; the truth is POSES.json (tools/scan_poses.py, from a scan alone). Simulated ones have
 noise of 0.3 to 2 m, as much bias as a plain receiver, and angles as wrong as those of `brighton`: in one
 strip of four some yaws are off by 180 degrees, as there. Each strip is placed with angles and without.
-
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +20,7 @@ from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from tools.figures import median, write_figures
-from tools.position_draws import SIGMAS, Flight, shares, squares
+from tools.position_draws import Flight, shares, squares, white
 from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
 _LEAST, _MOST_BEND = 5, 0.1  # photos of a real strip; its width over its length
@@ -92,14 +89,12 @@ def real_strips(truth: ScanTruth, photos: Path) -> Iterator[CameraStrip]:
             if size[1] > _MOST_BEND * size[0]:
                 continue
             flight = Flight(
-                name=names[first],
                 xyz=xyz[rows],
                 times_s=seconds[rows] - seconds[first],
                 cam_from_local=tuple(by_name[name] for name in names[rows]),
             )
-            yield CameraStrip(
-                flight=flight, positions=positions[rows], angles=tuple(exif.angles for exif in told[rows])
-            )
+            angles = tuple(exif.angles for exif in told[rows])
+            yield CameraStrip(flight=flight, positions=positions[rows], angles=angles)
 
 
 def simulated_strip(rng: np.random.Generator) -> CameraStrip:
@@ -124,20 +119,12 @@ def simulated_strip(rng: np.random.Generator) -> CameraStrip:
         )
         off = np.radians(common + rng.normal(0.0, _EACH_DEG))
         rotation = so3_exp([off[0], off[1], 0.0]) @ cam_from_enu(told.yaw_deg, told.pitch_deg, 0.0)
-        rotation = rotation @ so3_exp([0.0, 0.0, off[2]])
-        poses.append(Rigid3(rotation=rotation, translation=-rotation @ center))
+        poses.append(Rigid3.from_center(rotation @ so3_exp([0.0, 0.0, off[2]]), center))
         if flipped and rng.random() < 0.5:
             told = replace(told, yaw_deg=told.yaw_deg + 180.0)
         angles.append(told)
-    noise = rng.uniform(0.3, 2.0)
-    rest = np.sqrt(np.maximum(SIGMAS**2 - noise**2, 0.0))
-    flight = Flight(
-        name="simulated",
-        xyz=xyz,
-        times_s=4.0 * np.arange(count, dtype=np.float64),
-        cam_from_local=tuple(poses),
-    )
-    positions = xyz + rng.normal(0.0, noise, xyz.shape) + rng.normal(0.0, 1.0, 3) * rest
+    flight = Flight(xyz=xyz, times_s=4.0 * np.arange(count, dtype=np.float64), cam_from_local=tuple(poses))
+    positions = xyz + white(rng.uniform(0.3, 2.0))(flight, rng)
     return CameraStrip(flight=flight, positions=positions, angles=tuple(angles))
 
 

@@ -1,7 +1,5 @@
 """How right tracked films are: flights over the simulated town, anchored on its scan, against true poses.
 
-    python -m tools.track_evaluation --work DIR [--films smooth jerky cut]
-
 1. The world of `tools.worlds.scan_world`: `featuredb ingest photos` maps the drone's photos,
    `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
 2. Films of the same town at 1280x720 and 30 Hz: smooth; jerky, with gusts and turns on the spot; cut, which
@@ -51,13 +49,14 @@ from tools.worlds.scan_world import make_scan_world
 _FILMS = ("smooth", "jerky", "cut")
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
 _END = 200  # frames at each end whose errors are compared; of short films, a half each
-_FRAMES, _SEED = 1200, 1
+FRAMES, _SEED = 1200, 1
+_WORLD = WorldOptions.short(_SEED)
 _CUT = (0.4, 0.55)  # of the film
 
 
 def main() -> None:
     parser = study_parser(__doc__, "--work", "--inputs")
-    parser.add_argument("--frames", type=int, default=_FRAMES)
+    parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--on", choices=("map", "scan"), default="map", help="what is tracked by")
     parser.add_argument("--draw", action="store_true", help="lay a layer over each film, too")
@@ -67,28 +66,23 @@ def main() -> None:
         raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
     results: dict[str, dict[str, float]] = {}
     for name in args.films:
-        options = film_options(name, args.frames)
-        film = write_film(args.inputs / f"film-{name}-{args.frames}-{_SEED}", options) / FILM_FILE
-        truth = film_truth(options)
-        finder = finder_on(args.on, database, truth)
-        tracked = track_video(film, finder, camera=truth.camera)
+        film, truth = drawn_film(name, args.frames, args.inputs)
+        tracked = track_video(film, finder_on(args.on, database, truth), camera=truth.camera)
         results[name] = judge_film(tracked, truth)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
         if args.draw:
-            scene, track = town_of(options.world), tracked.trajectory
+            scene, track = town_of(_WORLD), tracked.trajectory
             results[f"{name}_layer"] = drawn_marks(args.work, film, truth, scene, track, database)
     write_figures(args.json, results)
 
 
 def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
     """What a film is tracked by: its map, or its scan from a coarse first pose."""
-    maps = Localiser.open(Database.open(database)).areas
     if what == "map":
-        return MapFinder(maps)
+        return MapFinder(Localiser.open(Database.open(database)).areas)
     (scan,) = list_scans(Database.open(database))
     cloud = load_cloud(Database.open(database), truth.frame, scan_ids=[scan.scan_id])
-    first = truth.cam_from_local[0]
-    start = off_pose(first, np.random.default_rng((_SEED, 5)), _START_M, _START_DEG)
+    start = off_pose(truth.cam_from_local[0], np.random.default_rng((_SEED, 5)), _START_M, _START_DEG)
     prior = FramePrior.around(start, _START_M, _START_DEG)
     return ScanFinder(cloud, scan.scan_id, truth.epsg, prior)
 
@@ -96,20 +90,14 @@ def finder_on(what: str, database: Path, truth: FilmTruth) -> Finder:
 def film_options(name: str, frames: int) -> FilmOptions:
     style: FlightStyle = "jerky" if name == "jerky" else "smooth"
     path = PathOptions(seed=_SEED, style=style, half_extent_m=(32.0, 26.0))
-    cut = tuple(round(share * frames) for share in _CUT) if name == "cut" else None
-    return FilmOptions(
-        world=WorldOptions.short(_SEED),
-        path=path,
-        frames=frames,
-        cut=None if cut is None else (cut[0], cut[1]),
-    )
+    cut = (round(_CUT[0] * frames), round(_CUT[1] * frames)) if name == "cut" else None
+    return FilmOptions(world=_WORLD, path=path, frames=frames, cut=cut)
 
 
-def smooth_film(inputs: Path) -> tuple[Path, FilmTruth]:
-    """The film `smooth` of 1,200 frames, with its telemetry beside it, and its truth; drawn once."""
-    options = film_options("smooth", _FRAMES)
-    folder = write_film(inputs / f"film-smooth-{_FRAMES}-{_SEED}", options)
-    return folder / FILM_FILE, film_truth(options)
+def drawn_film(name: str, frames: int, inputs: Path) -> tuple[Path, FilmTruth]:
+    """A film, with its telemetry beside it, and its truth; drawn once."""
+    options = film_options(name, frames)
+    return write_film(inputs / f"film-{name}-{frames}-{_SEED}", options) / FILM_FILE, film_truth(options)
 
 
 def axis_errors(
@@ -118,13 +106,11 @@ def axis_errors(
     """(n, 6) of every frame, east-north-up: rotation (rad) before displacement (m); NaN without a pose."""
     off = np.full((len(trajectory.points), 6), np.nan)
     for row, point in enumerate(trajectory.points):
-        true = cam_from_local[point.index]
-        if point.pose is None or true is None:
-            continue
-        center = frame.enu_from_utm(point.pose.utm, point.pose.epsg)
-        grid = frame.grid_from_enu(center, point.pose.epsg)
-        rotation = matrix_from_quaternion(point.pose.cam_from_utm_xyzw) @ grid
-        off[row] = [*so3_log(rotation.T @ true.rotation), *(center - true.center)]
+        pose, true = point.pose, cam_from_local[point.index]
+        if pose is not None and true is not None:
+            center = frame.enu_from_utm(pose.utm, pose.epsg)
+            rotation = matrix_from_quaternion(pose.cam_from_utm_xyzw) @ frame.grid_from_enu(center, pose.epsg)
+            off[row] = [*so3_log(rotation.T @ true.rotation), *(center - true.center)]
     return off
 
 
@@ -142,8 +128,6 @@ def judge_film(tracked: TrackedVideo, truth: FilmTruth, most: int = _END) -> dic
     off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
     metres = np.linalg.norm(off[:, 3:], axis=1)
     known = np.isfinite(metres)
-    if not known.any():
-        raise SystemExit(f"track_evaluation: no frame of {tracked.trajectory.source} has a pose")
     m = metres[known]
     end = min(most, max(len(m) // 2, 1))  # ends that overlap could not differ
     return {
@@ -162,22 +146,13 @@ def judge_film(tracked: TrackedVideo, truth: FilmTruth, most: int = _END) -> dic
 
 def _inside(trajectory: Trajectory, off: FloatArray) -> dict[str, float]:
     """How true the bounds are: the last figures of `judge_film`."""
-    rows = [k for k in range(len(off)) if np.isfinite(off[k]).all()]
-    points = [trajectory.points[k] for k in rows]
-    few = np.argsort([p.inliers for p in points], kind="stable")[: (len(points) + 3) // 4]
+    found = [(p, error) for p, error in zip(trajectory.points, off, strict=True) if np.isfinite(error).all()]
+    few = np.argsort([p.inliers for p, _ in found], kind="stable")[: (len(found) + 3) // 4]
     figures: dict[str, float] = {}
-    for name, part in (("orientation", slice(0, 3)), ("position", slice(3, 6))):
-        squares = np.array(
-            [
-                squared(off[k, part], p.pose.covariance[part, part])
-                for k, p in zip(rows, points, strict=True)
-                if p.pose is not None
-            ]
-        )
+    for name, k in (("orientation", slice(0, 3)), ("position", slice(3, 6))):
+        squares = np.array([squared(error[k], p.pose.covariance[k, k]) for p, error in found])
         figures |= {f"{name}_95": inside(squares, 0.95), f"few_{name}_95": inside(squares[few], 0.95)}
-        if name == "position":
-            figures |= {"squared": float(squares.mean()), "few_squared": float(squares[few].mean())}
-    return figures
+    return figures | {"squared": float(squares.mean()), "few_squared": float(squares[few].mean())}
 
 
 def _found_s(truth: FilmTruth, known: NDArray[np.bool_]) -> float:

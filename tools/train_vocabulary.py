@@ -38,14 +38,14 @@ _FEATURES = 3000  # the strongest of a photo, those that PairOptions aggregates
 _PER_PHOTO = 1500  # of these, what the centres are trained on
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="of each folder's photos, each Nth")
     parser.add_argument("--lists", type=int, default=None, metavar="K", help="centres of K inverted lists")
     parser.add_argument("--codes", action="store_true", help="centres of the parts of a product code")
     parser.add_argument("--out", type=Path, required=True)
-    args = parser.parse_args(argv)
+    args = parser.parse_args()
     use_threads(1)
     photos = [p for f in args.folders for p in scan_folder(f, ScanOptions()).usable[:: args.every]]
     options = ExtractorOptions(max_features=_FEATURES)
@@ -57,25 +57,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     if args.lists is not None:
         np.savez_compressed(args.out, centers=train_lists(descriptors, args.lists))
-        sys.stdout.write(f"{args.out}: {args.lists} lists from {len(photos)} photos\n")
-        return 0
-    if args.codes:
+    elif args.codes:
         np.savez_compressed(args.out, centers=train_codes(descriptors))
-        sys.stdout.write(f"{args.out}: codes from {len(photos)} photos\n")
-        return 0
-    vocabulary = train_vocabulary(descriptors)
-    np.savez(args.out, **{name: getattr(vocabulary, name) for name in ("mean", "projection", "words")})
-    sys.stdout.write(f"{args.out}: {len(photos)} photos, digest {vocabulary.digest}\n")
-    return 0
+    else:
+        vocabulary = train_vocabulary(descriptors)
+        np.savez(args.out, **{name: getattr(vocabulary, name) for name in ("mean", "projection", "words")})
+    sys.stdout.write(f"{args.out}: of {len(photos)} photos\n")
 
 
 def train_vocabulary(
     descriptors: Sequence[NDArray[np.uint8]], *, words: int = 128, dimensions: int = 32, seed: int = 0
 ) -> Vocabulary:
-    """Principal components and k-means of some descriptors of each photo, with fixed random choices.
-
-    Args:
-        descriptors: (n, 128) of each photo.
+    """Principal components and k-means of some descriptors (n, 128) of each photo, with fixed random choices.
 
     Raises:
         InvalidValueError: fewer descriptors than 40 a word, which k-means wants at least.
@@ -108,11 +101,11 @@ def train_codes(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]
 
 def _samples(descriptors: Sequence[NDArray[np.uint8]], clusters: int, seed: int) -> NDArray[np.float32]:
     generator = np.random.default_rng(seed)
-    parts = []
+    parts = [np.zeros((0, DESCRIPTOR_SIZE), np.float32)]
     for photo in descriptors:
         rows = generator.choice(len(photo), min(_PER_PHOTO, len(photo)), replace=False)
         parts.append(photo[np.sort(rows)].astype(np.float32))
-    samples = np.concatenate(parts) if parts else np.zeros((0, DESCRIPTOR_SIZE), np.float32)
+    samples = np.concatenate(parts)
     if len(samples) < 40 * clusters:
         raise InvalidValueError(
             f"train_vocabulary: expected at least {40 * clusters} descriptors for {clusters} words or lists, "
@@ -137,4 +130,4 @@ def _kmeans(samples: NDArray[np.float32], clusters: int, seed: int, iterations: 
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,7 +1,5 @@
 """A map without a place, placed on a scan by six picks in one photo, or found near a point: how right?
 
-    python -m tools.unplaced_brighton --photos FOLDER --scan LAZ --poses JSON --work FOLDER [--near]
-
 1. The photos but the held-out ones, without any position, become one map without a place.
 2. Each draw picks six points of the scan in one photo of the map, with 3 px of error, and
    `featuredb anchor --picks` places a copy of the map by them. True pixels come from the poses that
@@ -10,8 +8,7 @@
 
 With --near each draw names a point 100 m from the middle of the scan in a random direction, and
 `featuredb anchor --near` places the copy within 250 m: ten draws on the scan with its colours, ten on one
-whose intensities are its grey values. Then ten on a mirrored scan, which is no place on Earth: nothing may be
-placed.
+whose intensities are its grey values, and ten on a mirrored scan, which is no place on Earth.
 
 A draw is placed, refused, or wrong: placed with the held-out photos a metre off or not answered. A run that
 was stopped goes on in --work.
@@ -29,16 +26,15 @@ from featuredb.geo.utm import geodetic_from_utm
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from tools.commands import anchor, make, newest_copy, with_scan
-from tools.figures import kept, write_figures
+from tools.figures import kept, spread, write_figures
 from tools.photo_files import copied, photo_names
-from tools.picked import picks, read_scan, write_picks
+from tools.picked import Seen, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
 from tools.scan_poses import ScanTruth, scan_parser, scan_truth
 
 HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
 _WRONG_M = 1.0
 _DRAWS, _NEAR_DRAWS, _SEED = 20, 10, 1
-_SIGMA_PX = 3.0  # of a pick, each axis
 _KINDS = ("colour", "intensity", "mirrored")
 _AWAY_M, _RADIUS_M = 100.0, 250.0
 _GREY = np.array([0.299, 0.587, 0.114])
@@ -61,8 +57,8 @@ def by_picks(args: argparse.Namespace, truth: ScanTruth) -> dict[str, float]:
     def draw(number: int) -> dict[str, float] | None:
         rng = np.random.default_rng((_SEED, number))
         image = str(rng.choice(names))
-        drawn = picks(scan, truth.cameras[image], truth.poses[image], rng, _SIGMA_PX)
-        file = write_picks(work / f"picks-{number}.csv", image, *drawn)
+        seen = Seen(image=image, camera=truth.cameras[image], cam_from_local=truth.poses[image])
+        file = write_picks(work / f"picks-{number}.csv", scan, seen, rng)
         return placed_by(made, work, truth, "--picks", str(file), "--image", image)
 
     return {"draws": _DRAWS, **summed(all_drawn("draw", _DRAWS, draw, work), _DRAWS)}
@@ -100,7 +96,7 @@ def unplaced_map(photos: Path, work: Path) -> dict[str, float]:
         return make(work / "db", "photos", without)
 
     told = kept(work / "made.json", made)
-    return {"photos": len(names), "maps": told["maps"], "largest": told["largest"]}
+    return {"maps": told["maps"], "largest": told["largest"]}
 
 
 def placed_by(made: Path, work: Path, truth: ScanTruth, *start: str) -> dict[str, float] | None:
@@ -116,15 +112,12 @@ def placed_by(made: Path, work: Path, truth: ScanTruth, *start: str) -> dict[str
 
 def summed(placed: Sequence[dict[str, float]], draws: int) -> dict[str, float]:
     """How many were placed, refused, wrong; medians over the draws, and the worst draw's."""
-    metres, degrees = ([one[name] for one in placed] or [np.nan] for name in ("median_m", "median_deg"))
+    off = spread([one["median_m"] for one in placed], [one["median_deg"] for one in placed])
     return {
         "placed": len(placed),
         "refused": draws - len(placed),
         "wrong": sum(not one["median_m"] <= _WRONG_M or one["answered"] < one["asked"] for one in placed),
-        "median_m": float(np.median(metres)),
-        "worst_m": max(metres),
-        "median_deg": float(np.median(degrees)),
-        "worst_deg": max(degrees),
+        **{name.replace("largest", "worst"): value for name, value in off.items()},
     }
 
 
@@ -138,9 +131,8 @@ def scan_of(kind: str, scan: Path, work: Path) -> Path:
     made.header.add_crs(read.header.parse_crs())
     xyz, rgb = np.asarray(read.xyz), np.column_stack([read.red, read.green, read.blue])
     if kind == "intensity":
-        made.intensity = np.asarray(
-            np.minimum(rgb @ _GREY * (65535 / max(int(rgb.max()), 1)), 65535), np.uint16
-        )
+        grey = rgb @ _GREY * (65535 / max(int(rgb.max()), 1))
+        made.intensity = np.asarray(np.minimum(grey, 65535), np.uint16)
     else:
         xyz[:, 0] = xyz[:, 0].min() + xyz[:, 0].max() - xyz[:, 0]
         made.red, made.green, made.blue = rgb.T

@@ -1,17 +1,13 @@
 """A map without a place, placed by one that shows the same: how right, and is a strange one left alone?
 
-    python -m tools.unplaced_grown --photos FOLDER --work DIR --strange FOLDER
-
 1. Every second photo, with its GPS, is a map; the others, without any position, are one without a place, and
    so are the first ten photos of --strange, which show another town.
 2. `featuredb grow` places what it can.
 3. The photos of both maps of the place are compared with those of one map of all photos with their GPS, once
    it lies where the map by GPS has its own photos: what is left is what growing adds, not what GPS does not
    know.
-
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -33,12 +29,7 @@ def main() -> None:
     parser = study_parser(__doc__, "--photos", "--work")
     parser.add_argument("--strange", type=Path, required=True, metavar="FOLDER", help="photos of elsewhere")
     args = parser.parse_args()
-    write_figures(args.json, grown(args, args.work))
-
-
-def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
-    """Maps made in a folder, and what growing made of them."""
-    names, url = photo_names(args.photos), str(work / "db")
+    work, names, url = args.work, photo_names(args.photos), str(args.work / "db")
     copied(args.photos, names[::2], work / "placed", strip=False)
     copied(args.photos, names[1::2], work / "loose", strip=True)
     copied(args.strange, photo_names(args.strange)[:_STRANGE], work / "strange", strip=True)
@@ -61,7 +52,7 @@ def grown(args: argparse.Namespace, work: Path) -> dict[str, object]:
             figures |= {f"{name}_{what}": value for what, value in off.items()}
     if "loose" in maps:
         figures["bound_m"] = maps["loose"].placement.evidence["growth"]["drift_m"]
-    return figures
+    write_figures(args.json, figures)
 
 
 def placed_like(feature_map: FeatureMap, truth: FeatureMap) -> dict[str, Rigid3]:

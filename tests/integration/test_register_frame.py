@@ -19,7 +19,7 @@ from featuredb.simworld.town.town import make_town
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameOptions, available_sources, turned_about_vertical
 from ingest.register.frame_registration import FramePrior
-from tools.worlds.clouds import build_cloud
+from tests.support.clouds import build_cloud
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=800, height=600, params=(640.0, 398.0, 303.0, 0.02))
 OPTIONS = FrameOptions(threads=1)

@@ -19,7 +19,7 @@ from ingest.register.frame.dense.confirmation import confirm_pose
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameOptions, FrameViews, first_look
 from ingest.register.frame_registration import FramePrior
-from tools.worlds.clouds import build_cloud
+from tests.support.clouds import build_cloud
 
 CAMERA = Camera(
     model="SIMPLE_RADIAL", width=320, height=240, params=(300.0, 163.0, 118.0, -0.06)

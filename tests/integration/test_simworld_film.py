@@ -18,7 +18,6 @@ from tools.worlds.film_world import (
     GPS_SIGMA_M,
     TELEMETRY_FILE,
     TELEMETRY_LATE_S,
-    Exposure,
     FilmOptions,
     FlightPath,
     PathOptions,
@@ -35,7 +34,7 @@ _OPTIONS = FilmOptions(
     width=320,
     height=180,
     cut=(4, 6),
-    exposure=Exposure(samples=2),
+    samples=2,
 )
 
 
@@ -94,7 +93,7 @@ def test_a_rolling_shutter_shows_its_rows_one_after_the_other() -> None:
     """The first rows are those of half a frame before, the middle ones those of the frame's own time."""
     still = replace(_OPTIONS, frames=20, cut=None, ev_range=0.0, rate_hz=10.0)
     between = replace(still, frames=40, rate_hz=20.0)
-    rolling = replace(still, exposure=replace(still.exposure, readout_s=0.1))
+    rolling = replace(still, readout_s=0.1)
 
     def grey(options: FilmOptions, frame: int) -> np.ndarray:
         picture = cv2.cvtColor(film_frame(options, frame), cv2.COLOR_RGB2GRAY)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.render.cloud import point_spacing
-from tools.worlds.clouds import build_cloud
+from tests.support.clouds import build_cloud
 
 FRAME = LocalFrame(latitude_deg=-33.0, longitude_deg=151.0, height_m=20.0)
 

@@ -31,7 +31,7 @@ from featuredb.simworld.scan_world import write_scan
 from featuredb.simworld.world import Truth, World, WorldOptions, town_of, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
-from tools.worlds.film_world import Exposure, FilmOptions, PathOptions, write_film
+from tools.worlds.film_world import FilmOptions, PathOptions, write_film
 
 _LICENCE = "CC-BY-4.0"
 _TOWN = WorldOptions(
@@ -68,7 +68,7 @@ _FILM = FilmOptions(
     rate_hz=8.0,
     width=480,
     height=270,
-    exposure=Exposure(samples=1),
+    samples=1,
 )
 _FIRST_NAME = 27  # so that DJI_0034.JPG registers best
 

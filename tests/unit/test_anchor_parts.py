@@ -21,8 +21,8 @@ from ingest.register.anchor.report import AnchorReport
 from ingest.register.block import block_of_map
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from ingest.register.structure.surface_fit import map_move, map_residuals, median_m
+from tests.support.clouds import build_cloud
 from tests.support.maps import random_map
-from tools.worlds.clouds import build_cloud
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=800, height=600, params=(700.0, 400.0, 300.0, 0.0))
 

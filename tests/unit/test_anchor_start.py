@@ -23,8 +23,8 @@ from ingest.register.anchor.start.priors import (
     prior_from_map,
     read_pose,
 )
+from tests.support.clouds import build_cloud
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
-from tools.worlds.clouds import build_cloud
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=1600, height=1200, params=(1300.0, 800.0, 600.0, 0.02))
 

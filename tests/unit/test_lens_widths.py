@@ -8,7 +8,7 @@ import pytest
 from featuredb.adjust.terms import LensWidths, lens_prior
 from featuredb.geometry.camera import Camera
 from ingest.colmap.adjust import AdjustOptions
-from tools.lens_widths import WIDTHS, Told, assumed_widths, limits_of, measured_widths
+from tools.lens_widths import WIDTHS, Told, limits_of, measured_widths
 
 TRUE = LensWidths(focal_rel=0.01, aspect_rel=0.0005, center_rel=0.004, radial=0.03, tangential=0.001)
 
@@ -32,20 +32,18 @@ def told_of(count: int, seed: int) -> list[Told]:
 
 
 def test_the_widths_that_lenses_were_drawn_with_are_found() -> None:
-    options = AdjustOptions()
     told = told_of(100, 0)
-    measured = measured_widths(told, assumed_widths(options), options)
+    measured = measured_widths(told)
     for k, name in enumerate(WIDTHS):
         assert measured[k] == pytest.approx(getattr(TRUE, name), rel=0.4), name
 
 
 def test_the_limits_hold_the_truth_about_as_often_as_they_say() -> None:
-    options = AdjustOptions()
     held = []
     for seed in range(12):
         told = told_of(30, seed)
-        measured = measured_widths(told, assumed_widths(options), options)
+        measured = measured_widths(told)
         for k, name in enumerate(WIDTHS):
-            low, high = limits_of(told, measured, k, options)
+            low, high = limits_of(told, measured, k)
             held.append(low <= getattr(TRUE, name) <= high)
     assert np.mean(held) >= 0.85, np.mean(held)

@@ -16,8 +16,8 @@ from featuredb.render.cloud import PointCloud
 from reloc.answered_view import AnsweredView
 from reloc.pixels.locate import geojson, locate, read_coco
 from reloc.pixels.surfaces import MapSurface, ScanSurface, fit_patch, resampled, window_camera
+from tests.support.clouds import build_cloud
 from tests.support.scanned_map import EPSG, FRAME
-from tools.worlds.clouds import build_cloud
 
 LENS = Camera(
     model="OPENCV", width=800, height=600, params=(700.0, 705.0, 402.0, 297.0, 0.03, -0.02, 1e-3, 2e-3)

@@ -68,13 +68,10 @@ def _outcome(half: str, kind: str, error_m: float | None, log_nfa: float, accept
     return WindowOutcome(
         kind=kind,
         half=half,
-        column=0,
-        row=0,
         has_structure=True,
         accepted=accepted,
         error_m=error_m,
         log_nfa=log_nfa,
-        message="",
     )
 
 

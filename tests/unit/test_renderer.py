@@ -18,7 +18,7 @@ from featuredb.simworld.camera.photograph import look_pose
 from featuredb.simworld.camera.raster import render as cast_rays
 from featuredb.simworld.town.blocks import box, face
 from featuredb.simworld.town.scene import Ellipsoids, Faces
-from tools.worlds.clouds import build_cloud
+from tests.support.clouds import build_cloud
 
 FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=11.0, height_m=500.0)
 CAMERA = Camera(model="OPENCV", width=320, height=240, params=(240, 242, 163, 118, -0.08, 0.03, 1e-3, -7e-4))

@@ -47,12 +47,9 @@ def _stopped(signum: int, _: object) -> None:
 
 def _chosen(names: Sequence[str], full: bool) -> list[Row]:
     """The rows of these names, or all of the form."""
-    unknown = set(names) - {row.name for row in ROWS}
-    if unknown:
+    if unknown := set(names) - {row.name for row in ROWS}:
         raise SystemExit(f"no such row: {', '.join(sorted(unknown))}; --list names them")
-    if names:
-        return [row for row in ROWS if row.name in names]
-    return [row for row in ROWS if full or row.form == "quick"]
+    return [row for row in ROWS if (row.name in names if names else full or row.form == "quick")]
 
 
 def _run_all(rows: Sequence[Row], args: argparse.Namespace, commit: str) -> None:

@@ -27,11 +27,7 @@ class Limit:
 
     @classmethod
     def of(cls, text: str) -> "Limit":
-        """The limit that a text says.
-
-        Raises:
-            InvalidValueError: it says none.
-        """
+        """The limit that a text says. Raises InvalidValueError: it says none."""
         found = _LIMIT.fullmatch(text)
         least, figure, sign, most = found.groups() if found else (None,) * 4
         if figure is None or (least is None and most is None):

@@ -32,14 +32,13 @@ class Folders:
 
 def run(row: Row, places: Folders, commit: str) -> Result:
     """Measure a row. A command that fails leaves a result that says so; its output stays in `row.log`."""
-    work = places.work / row.name / commit
+    work, cache = places.work / row.name / commit, places.work / "cache"
     goes_on = row.resumes and not commit.endswith("+")
-    for old in work.parent.iterdir() if work.parent.is_dir() else ():
+    for old in work.parent.glob("*"):
         if old != work or not goes_on:
             shutil.rmtree(old, ignore_errors=True)
-    work.mkdir(parents=True, exist_ok=True)
-    cache = places.work / "cache"
-    cache.mkdir(exist_ok=True)
+    for folder in (work, cache):
+        folder.mkdir(parents=True, exist_ok=True)
     names = {"data": str(places.data.resolve()), "work": str(work), "cache": str(cache)}
     start, code, failure = time.monotonic(), 0, ""
     figures_file = work / "figures.json"

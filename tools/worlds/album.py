@@ -19,13 +19,12 @@ from typing import Any, Literal
 import numpy as np
 from PIL import ExifTags, Image
 
-from featuredb.errors import InvalidValueError
 from featuredb.simworld.camera.photograph import SensorOptions, Shot, exif_of, jpeg_bytes, take_photo
 from featuredb.simworld.flight import FlightOptions, survey
 from featuredb.simworld.town.scene import DayOptions, Scene, another_day
 from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
-from featuredb.simworld.world import TRUTH_FILE, TrueImage, Truth, in_order, true_image, write_truth
+from featuredb.simworld.world import TRUTH_FILE, Progress, TrueImage, Truth, in_order, true_image, write_truth
 from tools.worlds.edits import Edit, edited, edited_camera, indoor_photo, portrait_photo
 
 FACTS_FILE = "facts.jsonl"
@@ -38,7 +37,6 @@ _FIRST = datetime(2024, 3, 2, 0, 0, tzinfo=UTC)
 DAYS = 730
 _OTHER_SEED = 1000
 
-Progress = Callable[[int, int], None]
 Subject = Literal["town", "indoor", "portrait"]
 ExifPolicy = Literal["full", "no_gps", "none"]
 
@@ -65,12 +63,10 @@ class AlbumFact:
     Attributes:
         name: path within the album. photo_id: the site's number.
         kind: survey, street, drone, other_town, copy, indoor, portrait, ...; the worlds' modules list theirs.
-        owner, licence: as in the table.
-        time: of capture as claimed, timezone-aware.
+        owner, licence: as in the table. time: of capture as claimed, timezone-aware.
         home: it shows the town whose frame the truth is in, so that it has a true pose.
-        copy_of: the original, "" where this is one.
+        copy_of: the original, "" where this is one. batch: the step in which it arrives.
         visit: photos of one visit by one person share it; -1 for those of none.
-        batch: when it arrives, for worlds that arrive in steps.
     """
 
     name: str
@@ -120,10 +116,7 @@ def town_of(options: TownOptions, *, away: bool = False) -> Scene:
 
 
 def day_key(town: str, day: int, hour: float) -> str:
-    """Key of the scene of a town on a day (0 to 729) at an hour; sorts by what is dear to paint.
-
-    Days of a week share their parked cars.
-    """
+    """Key of the scene of a town on a day (0 to 729) at an hour; days of a week share their parked cars."""
     light = 1 if hour < 11 else 2 if hour < 15 else 3
     return f"{town}/{light}/{day // 7:03d}"
 
@@ -149,13 +142,9 @@ class PlannedPhoto:
 
     Attributes:
         shot: camera, pose, time, name within the album's folder. Its gps_enu is not used.
-        scene: key of the scene that it shows.
-        fact: what is true of it.
-        geotag: what it claims, or None.
+        scene: key of the scene that it shows. fact: what is true of it. geotag: what it claims.
         exif: full, no_gps (the position is in the table only), or none.
-        subject: what it shows.
-        edits: what was done to it afterwards.
-        quality: of the JPEG.
+        edits: what was done to it afterwards. quality: of the JPEG.
         sensor: of its camera, as this person uses it.
         orientation: EXIF orientation, 6 or 8 for a phone held upright that stores landscape pictures.
     """
@@ -196,16 +185,11 @@ def write_album(
 
     Raises:
         OSError: the folder cannot be written.
-        InvalidValueError: two photos of one name.
     """
-    folder = Path(folder)
     if (folder / TRUTH_FILE).exists():  # it comes last
         return folder
     home, photos = world.scene("home/0/000"), plan()
-    names = [photo.shot.name for photo in photos]
-    if len(set(names)) < len(names):
-        raise InvalidValueError("write_album: expected names that differ, found one twice")
-    for parent in {(folder / name).parent for name in names}:
+    for parent in {(folder / photo.shot.name).parent for photo in photos}:
         parent.mkdir(parents=True, exist_ok=True)
     # The same scenes lie together: a process takes a part of the list, and paints few scenes.
     todo = sorted((p for p in photos if not (folder / p.shot.name).exists()), key=lambda p: p.scene)
@@ -226,19 +210,18 @@ def write_album(
 def _truth(home: Scene, photo: PlannedPhoto) -> TrueImage | None:
     if not photo.fact.home:
         return None
-    camera = edited_camera(photo.shot.device.camera, photo.edits, photo.shot.seed)
+    shot = photo.shot
+    camera = edited_camera(shot.device.camera, photo.edits, shot.seed)
     if camera is None:
         return None
-    device = replace(photo.shot.device, camera=camera)
-    return true_image(home, replace(photo.shot, device=device, gps_enu=None))
+    return true_image(home, replace(shot, device=replace(shot.device, camera=camera), gps_enu=None))
 
 
 def _picture(scene: Scene, photo: PlannedPhoto) -> Image8:
-    if photo.subject == "indoor":
-        return indoor_photo(scene, photo.shot.device, photo.shot.seed, photo.sensor)
-    if photo.subject == "portrait":
-        return portrait_photo(scene, photo.shot.device, photo.shot.seed, photo.sensor)
-    return take_photo(scene, photo.shot, photo.sensor)
+    if photo.subject == "town":
+        return take_photo(scene, photo.shot, photo.sensor)
+    draw = indoor_photo if photo.subject == "indoor" else portrait_photo
+    return draw(scene, photo.shot.device, photo.shot.seed, photo.sensor)
 
 
 def _exif(photo: PlannedPhoto, image: Image8) -> Image.Exif | None:
@@ -281,11 +264,8 @@ def _write(folder: Path, world: TownOptions, photos: Sequence[PlannedPhoto], num
 
 def read_facts(folder: Path) -> dict[str, AlbumFact]:
     """Facts by name."""
-    lines = (folder / FACTS_FILE).read_text(encoding="utf-8").splitlines()
-    facts = [
-        AlbumFact(**{**row, "time": datetime.fromisoformat(row["time"])}) for row in map(json.loads, lines)
-    ]
-    return {fact.name: fact for fact in facts}
+    rows = map(json.loads, (folder / FACTS_FILE).read_text(encoding="utf-8").splitlines())
+    return {row["name"]: AlbumFact(**row | {"time": datetime.fromisoformat(row["time"])}) for row in rows}
 
 
 def _write_lines(path: Path, rows: Iterable[dict[str, Any]]) -> None:
@@ -313,7 +293,7 @@ def survey_photos(
     for i, shot in enumerate(survey(scene, flight, seed)):
         shot = replace(shot, name=f"{folder}/SW_{i + 1:04d}.jpg")
         assert shot.gps_enu is not None
-        latitude, longitude, height = scene.frame.geodetic_from_enu(shot.gps_enu)
+        latitude, longitude, height = (float(v) for v in scene.frame.geodetic_from_enu(shot.gps_enu))
         fact = AlbumFact(
             name=shot.name,
             photo_id=f"{folder}-{i + 1}",
@@ -322,7 +302,7 @@ def survey_photos(
             licence="CC-BY-4.0",
             time=shot.time,
         )
-        tag = Geotag(latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=float(height))
+        tag = Geotag(latitude_deg=latitude, longitude_deg=longitude, height_m=height)
         photos.append(PlannedPhoto(shot=shot, scene="home/0/000", fact=fact, geotag=tag))
     return photos
 

@@ -6,8 +6,6 @@ other_town; copy (a re-upload by somebody else); indoor, portrait (belong nowher
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -15,16 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.camera.photograph import look_pose
 from featuredb.simworld.flight import FlightOptions, shot_seed
 from featuredb.simworld.town.scene import Scene
-from tools.worlds.album import (
-    DAYS,
-    PlannedPhoto,
-    Subject,
-    TownOptions,
-    moment,
-    renamed,
-    survey_photos,
-    write_album,
-)
+from tools.worlds.album import DAYS, PlannedPhoto, Subject, TownOptions, moment, renamed, survey_photos
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.people import ACCURACY_SHARE, GeotagOptions, Person, community, geotag_at, planned
@@ -33,7 +22,7 @@ from tools.worlds.sights import find_sights
 # Of another town's visits: claimed here, or at their own place; the rest not at all.
 _TAGGED_HERE, _TAGGED_THERE = 0.6, 0.8
 _PEOPLE = 10
-_TAGGED = 1.0 / 3.0
+_TAGGED, _STREET_SIGMA_M = 1.0 / 3.0, 10.0  # geotags of street photos
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,13 +95,10 @@ def _other_tags(
         accuracy = float(np.round(options.sigma_m)) if rng.random() < ACCURACY_SHARE else None
         jitter = np.array([*rng.normal(0, 0.5 * options.sigma_m, 2), 0.0])
         if fate < _TAGGED_HERE:
-            tag = geotag_at(home, home.enu_from_town @ spot + jitter, 0.0, accuracy)
-            result.append(replace(p, geotag=tag))
+            p = replace(p, geotag=geotag_at(home, home.enu_from_town @ spot + jitter, 0.0, accuracy))
         elif fate < _TAGGED_THERE:
-            tag = geotag_at(away, p.shot.cam_from_local.center + jitter, 0.0, accuracy)
-            result.append(replace(p, geotag=tag))
-        else:
-            result.append(p)
+            p = replace(p, geotag=geotag_at(away, p.shot.cam_from_local.center + jitter, 0.0, accuracy))
+        result.append(p)
     return result
 
 
@@ -184,7 +170,6 @@ class StreetOptions(TownOptions):
         pieces: so many that no two walls of a house share their bricks: maps of those that do are joined
             wrongly, which is not what is asked here.
         photos: of all people. sights: places that they visit, the k-th 1/k as often as the first.
-        geotag_sigma_m: per horizontal axis; a third of the photos has a geotag.
     """
 
     seed: int = 1
@@ -194,19 +179,14 @@ class StreetOptions(TownOptions):
     width: int = 1000
     photos: int = 60
     sights: int = 4
-    geotag_sigma_m: float = 10.0
 
 
-def write_street_album(folder: Path, options: StreetOptions, workers: int = 0) -> Path:
-    """Write the photos with their table and truth; an album that is complete is kept."""
-    return write_album(folder, options, partial(_planned, options), workers)
-
-
-def _planned(options: StreetOptions) -> list[PlannedPhoto]:
+def street_album(options: StreetOptions) -> list[PlannedPhoto]:
+    """All photos; a third of them has a geotag."""
     home, people = options.scene("home/0/000"), _walkers(options.width)
     places = find_sights(home, options.sights, options.seed)
     photos = plan_visits(home, people, places, options.photos, options.seed, "home", by_rank=True)
-    geotags = GeotagOptions(sigma_m=options.geotag_sigma_m, far_share=0.0)
+    geotags = GeotagOptions(sigma_m=_STREET_SIGMA_M, far_share=0.0)
     rng = np.random.default_rng((options.seed, 58))
     return named(tagged(home, photos, people, geotags, rng), options.seed)
 

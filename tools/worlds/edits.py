@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,6 @@ from featuredb.simworld.town.scene import Ellipsoids, Faces, Scene
 from featuredb.simworld.town.texture import Image8
 
 _SKIN = (1.9, 1.25, 1.9)  # factors on the leaf texture's green
-_TWO_FOCALS = ("OPENCV", "PINHOLE", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +64,7 @@ def edited_camera(camera: Camera, edits: tuple[Edit, ...], seed: int) -> Camera 
             camera = camera.scaled_to(*_resized_size(camera.width, camera.height, edit.amount))
         elif edit.kind in ("cropped", "bordered"):
             x0, y0, w, h = _window(camera.width, camera.height, edit, np.random.default_rng((seed, 91, i)))
-            first = 2 if camera.model in _TWO_FOCALS else 1
+            first = 2 if camera.model == "OPENCV" else 1  # people's others have one focal length
             cx, cy = camera.params[first : first + 2]
             params = (*camera.params[:first], cx - x0, cy - y0, *camera.params[first + 2 :])
             camera = replace(camera, width=w, height=h, params=params)
@@ -76,8 +76,7 @@ def _resized_size(width: int, height: int, factor: float) -> tuple[int, int]:
 
 
 def _window(width: int, height: int, edit: Edit, rng: np.random.Generator) -> tuple[int, int, int, int]:
-    """x0, y0, width, height of a cropped or bordered picture; people cut more from one side than from the
-    other."""
+    """x0, y0, width, height of a cropped or bordered picture; sides are cut unevenly."""
     if edit.kind == "bordered":
         border = max(1, round(width * edit.amount))
         return -border, -border, width + 2 * border, height + 2 * border
@@ -158,13 +157,13 @@ def _painted_over(image: Image8, edit: Edit, rng: np.random.Generator) -> Image8
     result = image.copy()
     for _ in range(4):
         x0, y0, x1, y1 = _patch(image, edit.amount / 4, rng)
-        colour = tuple(int(c) for c in rng.choice([(96, 112, 64), (150, 146, 140), (190, 180, 160)]))
+        colour = rng.choice([(96, 112, 64), (150, 146, 140), (190, 180, 160)])
         mask = np.zeros(image.shape[:2], np.uint8)
         centre = ((x0 + x1) // 2, (y0 + y1) // 2)
         cv2.ellipse(mask, centre, ((x1 - x0) // 2 + 1, (y1 - y0) // 2 + 1), 0.0, 0.0, 360.0, 255, -1)
         soft = cv2.GaussianBlur(mask, (0, 0), 4.0)[..., None].astype(np.float32) / 255.0
         grain = rng.normal(0.0, 4.0, image.shape).astype(np.float32)
-        painted = result * (1 - soft) + (np.array(colour, np.float32) + grain) * soft
+        painted = result * (1 - soft) + (colour.astype(np.float32) + grain) * soft
         result = np.clip(painted, 0, 255).astype(np.uint8)
     return result
 
@@ -175,9 +174,8 @@ def _warped(image: Image8, edit: Edit, rng: np.random.Generator) -> Image8:
     field = rng.uniform(-1, 1, (2, 5, 6)).astype(np.float32) * np.float32(edit.amount * w)
     dx, dy = (cv2.resize(f, (w, h), interpolation=cv2.INTER_CUBIC) for f in field)
     x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
-    return np.asarray(
-        cv2.remap(image, x + dx, y + dy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101), dtype=np.uint8
-    )
+    warped = cv2.remap(image, x + dx, y + dy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    return np.asarray(warped, dtype=np.uint8)
 
 
 _EDITORS: dict[str, Callable[[Image8, Edit, np.random.Generator], Image8]] = {
@@ -276,17 +274,6 @@ def _room(rng: np.random.Generator, size: FloatArray) -> Faces:
         at = rng.uniform(-0.45, 0.45, 2) * size
         at *= max(1.5 / max(float(np.linalg.norm(at)), 0.3), 1.0)
         texture, yaw_deg = str(rng.choice(["wood", "plain"])), float(rng.choice([0, 90]))
-        parts.append(
-            box(
-                float(at[0]),
-                float(at[1]),
-                0.0,
-                (w, d, h),
-                30 + i,
-                yaw_deg=yaw_deg,
-                texture=texture,
-                detail=start(),
-                tint=tint(0.4, 1.2),
-            )
-        )
+        look: dict[str, Any] = {"texture": texture, "detail": start(), "tint": tint(0.4, 1.2)}
+        parts.append(box(float(at[0]), float(at[1]), 0.0, (w, d, h), 30 + i, yaw_deg=yaw_deg, **look))
     return Faces.concatenate(parts)

@@ -53,10 +53,8 @@ class PathOptions:
 
     Attributes:
         seed: of the way. style: smooth; or jerky: gusts, and turns on the spot of up to 95 degrees in 0.8 s.
-        duration_s: of the flight.
         half_extent_m: it stays within (+-x, +-y) of the town's middle, town axes.
-        heights_m: over the town's origin. speed_m_s: over ground.
-        down_deg: how far below the horizon it looks.
+        heights_m: over the town's origin. speed_m_s: over ground. down_deg: of its view, below the horizon.
         river: whether the way leads over the water and looks down on it.
     """
 
@@ -81,7 +79,7 @@ class FlightPath:
 
     def __init__(self, scene: Scene, options: PathOptions) -> None:
         rng = np.random.default_rng((options.seed, 71))
-        self._options, self._turn = options, scene.enu_from_town
+        self._turn = scene.enu_from_town
         times, places = _waypoints(scene, options, rng)
         self._place = CubicSpline(times, places)
         down = rng.uniform(*options.down_deg, len(times))
@@ -89,7 +87,9 @@ class FlightPath:
             over = np.abs(places[:, 1] - np.mean(scene.plan.river)) < 15.0
             down[over] = options.down_deg[1] + 10.0
         self._pitch = PchipInterpolator(times, -down)
-        self._heading = PchipInterpolator(times, _headings(places))
+        # From each place's last neighbour to its next: along its way it would spin where that turns back.
+        away = np.gradient(places[:, :2], axis=0)
+        self._heading = PchipInterpolator(times, np.degrees(np.unwrap(np.arctan2(away[:, 0], away[:, 1]))))
         self._gusts = _Gusts(rng) if options.style == "jerky" else None
         self._snaps = _snaps(options, rng) if options.style == "jerky" else []
 
@@ -105,8 +105,7 @@ class FlightPath:
             place, heading, pitch, roll = place + shift, heading + turn[0], pitch + turn[1], turn[2]
         # Headings are those of the town's axes, turned against north with them.
         town = look_pose(place, float(heading), pitch, float(roll))
-        rotation = town.rotation @ self._turn.T
-        return Rigid3(rotation=rotation, translation=-rotation @ (self._turn @ place))
+        return Rigid3.from_center(town.rotation @ self._turn.T, self._turn @ place)
 
 
 class _Gusts:
@@ -129,8 +128,7 @@ def _waypoints(scene: Scene, options: PathOptions, rng: np.random.Generator) -> 
     times, places = [-4.0], [_inside(options, rng)]
     at_river = int(options.duration_s / (2.0 * np.mean(_LEG_S))) + 1
     while times[-1] < options.duration_s + 4.0:
-        leg = float(rng.uniform(*_LEG_S))
-        reach = options.speed_m_s * leg
+        reach = options.speed_m_s * float(rng.uniform(*_LEG_S))
         before = places[-1]
         candidates = np.array([_inside(options, rng) for _ in range(40)])
         off = np.abs(np.linalg.norm(candidates[:, :2] - before[:2], axis=1) - reach)
@@ -141,15 +139,6 @@ def _waypoints(scene: Scene, options: PathOptions, rng: np.random.Generator) -> 
         times.append(times[-1] + float(np.linalg.norm(chosen - before)) / options.speed_m_s + 0.3)
         places.append(chosen)
     return np.array(times), np.array(places)
-
-
-def _headings(places: FloatArray) -> FloatArray:
-    """(n,) degrees clockwise from the town's north, from each place's last neighbour to its next, unwrapped.
-
-    A camera that turns with its way would spin where the way turns back.
-    """
-    away = np.gradient(places[:, :2], axis=0)
-    return np.asarray(np.degrees(np.unwrap(np.arctan2(away[:, 0], away[:, 1]))), dtype=np.float64)
 
 
 def _inside(options: PathOptions, rng: np.random.Generator) -> FloatArray:
@@ -166,29 +155,16 @@ def _snaps(options: PathOptions, rng: np.random.Generator) -> list[tuple[float, 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Exposure:
-    """How a frame is exposed.
-
-    Attributes:
-        samples: pictures of its time, in which what moves is blurred, that are averaged; each looks through
-            other parts of the pixels.
-        readout_s: rolling shutter, from the first row to the last; the frame's time is its middle row's.
-        ev: stops brighter than the scene is.
-    """
-
-    samples: int = 4
-    readout_s: float = 0.0
-    ev: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FilmOptions:
     """What to write. The same options give the same frames.
 
     Attributes:
         world: whose town is filmed. path: how the camera flies; its duration is that of the frames.
         frames, rate_hz: of the film. width, height: pixels.
-        exposure: of a frame, but for what follows.
+        samples: pictures of a frame's time, in which what moves is blurred, that are averaged; each looks
+            through other parts of the pixels.
+        readout_s: rolling shutter, from the first row to the last; the frame's time is its middle row's.
+        ev: stops brighter than the scene is.
         ev_range: stops between the darkest and the brightest exposure, which follow each other slowly, and
             leap once where the flight is jerky.
         focal: of the lens, in widths of the picture. zoom: what it becomes in the middle third of the film.
@@ -201,7 +177,9 @@ class FilmOptions:
     rate_hz: float = 30.0
     width: int = 1280
     height: int = 720
-    exposure: Exposure = field(default_factory=Exposure)
+    samples: int = 4
+    readout_s: float = 0.0
+    ev: float = 0.0
     ev_range: float = 0.7
     focal: float = 0.757
     zoom: float | None = None
@@ -235,8 +213,7 @@ class FilmTruth:
 
     Attributes:
         camera: true intrinsics. frame, epsg: local frame of the poses, UTM zone of answers.
-        times_s: (n,) seconds.
-        cam_from_local: true poses; None where the frame does not show the town.
+        times_s: (n,) seconds. cam_from_local: true poses; None where the frame does not show the town.
     """
 
     camera: Camera
@@ -252,11 +229,8 @@ class FilmTruth:
 
 
 def write_film(folder: Path, options: FilmOptions, workers: int = 0) -> Path:
-    """Write film and telemetry into `folder`; a folder that holds just these is left as it is.
-
-    Args:
-        workers: processes; 0 takes one per core.
-    """
+    """Write film and telemetry into `folder`, by so many processes, 0 for one per core; a folder that holds
+    just these is left as it is."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / TELEMETRY_FILE).write_text(_telemetry(options), encoding="utf-8")
     tags = {"creation_time": _START.isoformat()}
@@ -287,7 +261,7 @@ def film_truth(options: FilmOptions) -> FilmTruth:
 
 def film_frame(options: FilmOptions, frame: int) -> Image8:
     """One frame (h, w, 3) uint8 RGB as the camera's sensor gives it."""
-    home, time_s, n = options.at_home(frame), options.time_s(frame), options.exposure.samples
+    home, time_s, n = options.at_home(frame), options.time_s(frame), options.samples
     scene, path, camera = _scene(options, home), _path(options, home), options.camera_at(frame)
     look = scene_look(scene, water_seed=int(time_s * _GLITTER_HZ))
     faces = Faces.concatenate([scene.faces, moving_cars(scene, options.path.seed, time_s=time_s)])
@@ -296,7 +270,7 @@ def film_frame(options: FilmOptions, frame: int) -> Image8:
         moment_s = time_s + _SHUTTER_S * ((k + 0.5) / n - 0.5)
         # Another part of each pixel: a rank-1 lattice over its square.
         shift = (float((k + 0.5) / n - 0.5), float((k * 0.618034 + 0.5 / n) % 1.0 - 0.5))
-        for top, bottom, later_s in _bands(camera.height, options.exposure.readout_s):
+        for top, bottom, later_s in _bands(camera.height, options.readout_s):
             f, cx, cy, *rest = camera.params
             params = (f, cx - shift[0], cy - shift[1] - top, *rest)
             part = replace(camera, height=bottom - top, params=params)
@@ -321,7 +295,7 @@ def wandering_errors(rng: np.random.Generator, sigma_m: float, keep: float, coun
 def _exposure_ev(options: FilmOptions, time_s: float) -> float:
     slow = 0.5 * options.ev_range * np.sin(2.0 * np.pi * time_s / 17.0)
     leaps = options.path.style == "jerky" and time_s > 0.6 * options.frames / options.rate_hz
-    return float(options.exposure.ev + slow + (0.6 * options.ev_range if leaps else 0.0))
+    return float(options.ev + slow + (0.6 * options.ev_range if leaps else 0.0))
 
 
 @lru_cache(maxsize=2)
@@ -385,9 +359,7 @@ def write_frames(
 
 def _bands(height: int, readout_s: float) -> list[tuple[int, int, float]]:
     """Rows (first, last + 1) that are exposed together, and how much later than the frame's middle."""
-    if readout_s == 0:
-        return [(0, height, 0.0)]
-    edges = np.linspace(0, height, _BANDS + 1).round().astype(int).tolist()
+    edges = np.linspace(0, height, (_BANDS if readout_s else 1) + 1).round().astype(int).tolist()
     return [
         (top, bottom, readout_s * (0.5 * (top + bottom) / height - 0.5)) for top, bottom in pairwise(edges)
     ]

@@ -93,9 +93,7 @@ def _view(
     if not inside.all() or not around.free(look.eye):
         return None
     pose = look_at(around.scene, look.eye, look.target, look.turn_deg)
-    if not around.worth_taking(device.camera, pose, nearest_m):
-        return None
-    return device, pose, orientation
+    return (device, pose, orientation) if around.worth_taking(device.camera, pose, nearest_m) else None
 
 
 class _Flight:
@@ -123,8 +121,8 @@ class _Flight:
         height = self._at(self._target, above)[2]
         looks = []
         for i in range(self._count):
-            eye = self._target + radius * _ahead(start + step * i) + rng.normal(0, 0.8, 3)
-            looks.append(Viewpoint(eye=np.array([*eye[:2], height]), target=self._target))
+            x, y, _ = self._target + radius * _ahead(start + step * i) + rng.normal(0, 0.8, 3)
+            looks.append(Viewpoint(eye=np.array([x, y, height]), target=self._target))
         return looks
 
     def climb(self) -> list[Viewpoint]:
@@ -210,8 +208,6 @@ def plan_visits(
         kind: of the facts; by default street or drone.
     """
     rng = np.random.default_rng((seed, 52))
-    if not places:
-        raise InvalidValueError(f"plan_visits: no sight of {scene.name} can be photographed")
     around = Surroundings(scene)
     shares = np.array([p.weight for p in people]) / sum(p.weight for p in people)
     taken_by = np.zeros(len(people))
@@ -229,9 +225,7 @@ def plan_visits(
         photos += taken[: count - len(photos)]
         visit += 1
         if visit - first_visit > _VISIT_TRIES * max(count, 50):
-            raise InvalidValueError(
-                f"plan_visits: only {len(photos)} of {count} photos came of {visit} visits"
-            )
+            raise InvalidValueError(f"plan_visits: {len(photos)} of {count} photos came of {visit} visits")
     return photos
 
 
@@ -280,15 +274,11 @@ def tagged(
 ) -> list[PlannedPhoto]:
     """The photos with their geotags."""
     by_name = {p.name: p for p in people}
-    asked = [
-        Tagging(
-            center=p.shot.cam_from_local.center,
-            visit=p.fact.visit,
-            tagged=bool(rng.random() < by_name[p.fact.owner].tags),
-            by_hand=by_name[p.fact.owner].by_hand,
-        )
-        for p in photos
-    ]
+    asked = []
+    for p in photos:
+        owner, center = by_name[p.fact.owner], p.shot.cam_from_local.center
+        has_tag = bool(rng.random() < owner.tags)
+        asked.append(Tagging(center=center, visit=p.fact.visit, tagged=has_tag, by_hand=owner.by_hand))
     given = give_geotags(scene, asked, options, rng)
     return [replace(p, geotag=tag) for p, tag in zip(photos, given, strict=True)]
 

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.simworld.camera.photograph import Device, SensorOptions, Shot
@@ -25,20 +25,16 @@ class Person:
     """A contributor.
 
     Attributes:
-        name, licence: attribution.
-        drone, ground: cameras, None where there is none.
-        drone_share: of the photos taken by drone.
+        drone, ground: cameras. drone_share: of the photos taken by drone, of who has both.
         weight: how many photos, relative to the others.
         heights_m: of most drone photos over the ground.
         skill: 0 to 1; careless people tilt the camera, stand anywhere and blur their photos.
         upright: ground photos held upright: never, stored as landscape with an EXIF orientation, or
             stored upright.
         zoom: largest factor on the focal length of the ground camera.
-        exif: what is left of it.
-        tags: share of photos with a geotag.
+        exif: what is left of it. tags: share of photos with a geotag.
         by_hand: geotags are set on the site's map, without height.
-        quality: of the JPEG.
-        edits: on every photo. crop_share: of the photos that are cropped as well.
+        edits: on every photo. crop_share: of the photos that are cropped as well. quality: of the JPEG.
     """
 
     name: str
@@ -78,18 +74,10 @@ def planned(person: Person, kind: str, **more: Any) -> PlannedPhoto:
 
 
 def make_device(
-    make: str,
-    name: str,
-    size: tuple[int, int],
-    focal_35mm: float,
-    lens: tuple[float, ...],
-    focal_mm: float = 5.0,
+    make: str, name: str, size: tuple[int, int], focal_35mm: float, lens: tuple[float, ...], focal_mm: float
 ) -> Device:
-    """A camera by its 35 mm equivalent (of the width) and its distortion.
-
-    Args:
-        lens: one number for SIMPLE_RADIAL, two for RADIAL, four for OPENCV.
-    """
+    """A camera by its 35 mm equivalent (of the width) and its distortion: one number for SIMPLE_RADIAL, two
+    for RADIAL, four for OPENCV."""
     w, h = size
     f = focal_35mm / 36.0 * w
     model = {1: "SIMPLE_RADIAL", 2: "RADIAL", 4: "OPENCV"}[len(lens)]
@@ -116,13 +104,9 @@ def zoomed(device: Device, factor: float) -> Device:
 def stored_upright(device: Device) -> Device:
     """The same camera turned by a quarter, pixels stored upright."""
     camera = device.camera
-    f, cx, cy, *lens = camera.params
-    if camera.model == "OPENCV":
-        raise InvalidValueError("stored_upright: expected a camera with one focal length, found OPENCV")
-    turned = replace(
-        camera, width=camera.height, height=camera.width, params=(f, camera.height - cy, cx, *lens)
-    )
-    return replace(device, camera=turned)
+    f, cx, cy, *lens = camera.params  # of one focal length: nobody holds others upright
+    params = (f, camera.height - cy, cx, *lens)
+    return replace(device, camera=replace(camera, width=camera.height, height=camera.width, params=params))
 
 
 def community(width: int = 1600) -> tuple[Person, ...]:
@@ -132,12 +116,9 @@ def community(width: int = 1600) -> tuple[Person, ...]:
         w = round(share * width / 4) * 4
         return w, round(w * aspect / 4) * 4
 
-    big = make_device(
-        "Simworld", "SW-Drone 2 Pro", px(1.0, 0.75), 24.3, (-0.062, 0.024, 0.0005, -0.0004), 10.3
-    )
-    big_too = make_device(
-        "Simworld", "SW-Drone 2 Pro", px(1.0, 0.75), 24.1, (-0.059, 0.022, -0.0003, 0.0002), 10.3
-    )
+    pro = partial(make_device, "Simworld", "SW-Drone 2 Pro", px(1.0, 0.75), focal_mm=10.3)
+    big = pro(24.3, (-0.062, 0.024, 0.0005, -0.0004))
+    big_too = pro(24.1, (-0.059, 0.022, -0.0003, 0.0002))
     mini = make_device("Simworld", "SW-Mini", px(0.9, 0.75), 28.7, (0.021, -0.013), 6.7)
     mini_too = make_device("Simworld", "SW-Mini", px(0.9, 0.75), 29.2, (0.024, -0.016), 6.7)
     wide = make_device("Otherworld", "Action 7", px(0.95, 0.5625), 19.0, (-0.11, 0.031, 0.0002, 0.0003), 3.0)
@@ -150,8 +131,8 @@ def community(width: int = 1600) -> tuple[Person, ...]:
     system = make_device("Lumen", "System 4", px(1.0, 0.6667), 34.5, (-0.024,), 23.0)
     poor = SensorOptions(blur_px=0.95, read_noise=2.2, shot_noise=4.5, exposure_sigma_ev=0.35)
     return (
-        Person(name="anna", ground=phone_a, upright="tagged", weight=1.3, skill=0.7),
-        Person(name="bert", drone=big, drone_share=1.0, weight=1.5, heights_m=(45, 110), skill=0.9),
+        Person(name="anna", ground=phone_a, upright="tagged", weight=1.3),
+        Person(name="bert", drone=big, weight=1.5, heights_m=(45, 110), skill=0.9),
         Person(
             name="carla",
             drone=mini,
@@ -165,23 +146,14 @@ def community(width: int = 1600) -> tuple[Person, ...]:
             name="dmitri",
             ground=compact,
             zoom=2.2,
-            weight=1.0,
             exif="no_gps",
             by_hand=True,
             licence="CC-BY-SA-2.0",
             skill=0.8,
         ),
-        Person(
-            name="elif",
-            drone=mini_too,
-            drone_share=1.0,
-            weight=1.1,
-            heights_m=(20, 70),
-            exif="none",
-            by_hand=True,
-        ),
+        Person(name="elif", drone=mini_too, weight=1.1, heights_m=(20, 70), exif="none", by_hand=True),
         Person(name="farid", ground=phone_old, weight=0.7, skill=0.35, quality=74, sensor=poor),
-        Person(name="greta", drone=wide, drone_share=1.0, weight=0.8, heights_m=(15, 50), skill=0.6),
+        Person(name="greta", drone=wide, weight=0.8, heights_m=(15, 50), skill=0.6),
         Person(
             name="hugo",
             ground=chat,
@@ -198,7 +170,6 @@ def community(width: int = 1600) -> tuple[Person, ...]:
             drone=big_too,
             ground=system,
             drone_share=0.6,
-            weight=1.0,
             heights_m=(30, 100),
             skill=0.95,
             licence="CC-BY-NC-4.0",
@@ -216,25 +187,8 @@ def community(width: int = 1600) -> tuple[Person, ...]:
             heights_m=(15, 45),
             skill=0.9,
         ),
-        Person(
-            name="kiri",
-            ground=phone_b,
-            weight=1.0,
-            crop_share=0.3,
-            exif="no_gps",
-            licence="CC0-1.0",
-            skill=0.6,
-        ),
-        Person(
-            name="lena",
-            drone=air,
-            ground=compact,
-            drone_share=0.75,
-            weight=1.0,
-            heights_m=(18, 90),
-            tags=0.0,
-            skill=0.7,
-        ),
+        Person(name="kiri", ground=phone_b, crop_share=0.3, exif="no_gps", licence="CC0-1.0", skill=0.6),
+        Person(name="lena", drone=air, ground=compact, drone_share=0.75, heights_m=(18, 90), tags=0.0),
     )
 
 
@@ -265,29 +219,21 @@ class Tagging:
 def give_geotags(
     scene: Scene, photos: Sequence[Tagging], options: GeotagOptions, rng: np.random.Generator
 ) -> list[Geotag | None]:
-    """A geotag for each photo.
-
-    Geotags of the far kind claim the same accuracy as others: nothing in a file gives them away.
-    """
+    """A geotag for each photo; those of the far kind claim the same accuracy as others."""
     far = _far_ones(photos, options.far_share, rng)
+    share = np.sqrt(0.5) * options.sigma_m
     shared: dict[int, FloatArray] = {}
     given: list[Geotag | None] = []
     for i, photo in enumerate(photos):
-        share = np.sqrt(0.5) * options.sigma_m
-        common = shared.setdefault(photo.visit, rng.normal(0, share, 2)) if photo.visit >= 0 else None
-        own = rng.normal(0, share, 2)
-        error = own + (common if common is not None else rng.normal(0, share, 2))
+        common = shared.setdefault(photo.visit, rng.normal(0, share, 2))
+        error = rng.normal(0, share, 2) + common
         height_error = float(rng.normal(0, _HEIGHT_SIGMA_M))
         claimed = float(np.clip(np.round(options.sigma_m * rng.lognormal(0.0, 0.4)), 3, 200))
         says = rng.random() < ACCURACY_SHARE
-        if not photo.tagged:
-            given.append(None)
-            continue
-        if i in far:
-            error = far[i]
         height = None if photo.by_hand else height_error
-        center = photo.center + np.append(error, 0.0)
-        given.append(geotag_at(scene, center, height, claimed if says else None))
+        center = photo.center + np.append(far.get(i, error), 0.0)
+        tag = geotag_at(scene, center, height, claimed if says else None)
+        given.append(tag if photo.tagged else None)
     return given
 
 
@@ -309,7 +255,7 @@ def _far_ones(photos: Sequence[Tagging], share: float, rng: np.random.Generator)
     tagged = [i for i, photo in enumerate(photos) if photo.tagged]
     wanted = round(share * len(tagged))
     far: dict[int, FloatArray] = {}
-    visits = sorted({photos[i].visit for i in tagged if photos[i].visit >= 0})
+    visits = sorted({photos[i].visit for i in tagged})
     for visit in rng.permutation(visits):
         mine = [i for i in tagged if photos[i].visit == visit]
         if len(far) + len(mine) <= wanted // 2:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,11 @@ from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.blocks import face
 from featuredb.simworld.town.scene import TEXTURES, Ellipsoids, Faces, GroundPlan, Scene, texture_index
 from featuredb.simworld.town.town import BUILDING_ID
-from tools.worlds.album import Geotag, PlannedPhoto, TownOptions, day_scene, renamed, survey_photos, town_of
+from tools.worlds.album import PlannedPhoto, TownOptions, day_scene, renamed, survey_photos, town_of
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
 from tools.worlds.people import GeotagOptions, Person, community, geotag_at
-from tools.worlds.sights import Sight, find_sights
+from tools.worlds.sights import Rect, Sight, find_sights, lies_in
 
 POISONS = ("lookalike", "mirrored", "mirror_block", "liar", "liar_other", "altered", "forged")
 _LIE_M = (130.0, 75.0)  # shift of the liar's positions, east and north: another block
@@ -44,8 +44,6 @@ _EDITS = (
     Edit(kind="painted_over", amount=0.3),
     Edit(kind="warped", amount=0.02),
 )
-Rect = tuple[float, float, float, float]
-T = TypeVar("T", Faces, Ellipsoids)
 
 _PATCH_M = 0.02  # the copied ground lies this much over the old one
 _ID_SHIFT = 50_000
@@ -58,8 +56,7 @@ class PoisonOptions(TownOptions):
 
     Attributes:
         honest, late: photos of honest people before and after the poison. canaries: held-out photos.
-        per_poison: photos of each of POISONS.
-        sights: places that honest people visit.
+        per_poison: photos of each of POISONS. sights: places that honest people visit.
     """
 
     seed: int = 4
@@ -100,11 +97,7 @@ def _with_traps(options: PoisonOptions, kind: str) -> Scene:
 
 
 def poison_places(options: PoisonOptions) -> Places:
-    """The blocks: copies stand in the rows of their originals, as far from the mapped area as possible.
-
-    Raises:
-        InvalidValueError: a town with fewer than two rows of blocks, or without blocks on both sides.
-    """
+    """The blocks: copies stand in the rows of their originals, as far from the mapped area as possible."""
     half_x, half_y = survey_half_extent(options.flight)
     cx, cy = options.flight.center_m
     mapped = (cx - half_x, cy - half_y, cx + half_x, cy + half_y)
@@ -114,32 +107,20 @@ def poison_places(options: PoisonOptions) -> Places:
     pairs = []
     for row in rows.values():
         row.sort()
-        inside = [b for b in row if _covers(mapped, b)]
+        inside = [b for b in row if lies_in(mapped, 0.5 * (b[0] + b[2]), 0.5 * (b[1] + b[3]))]
         outside = [b for b in row if b[0] > mapped[2] + 25.0]
         if inside and outside:
             pairs.append(min((_unfit(options, a, b), a, b) for a in inside for b in outside[-2:])[1:])
-    if len(pairs) < 2:
-        raise InvalidValueError(
-            f"PoisonOptions: expected a town with two rows of blocks inside and outside of the survey, "
-            f"found {len(pairs)} in {options.town_size_m}"
-        )
-    (source, target), (mirror_source, mirror_target) = pairs[0], pairs[1]
-    return Places(mapped, source, target, mirror_source, mirror_target)
+    first, second, *_ = pairs  # such a town has two rows or more
+    return Places(mapped, *first, *second)
 
 
 def _unfit(options: PoisonOptions, source: Rect, target: Rect) -> float:
     """How badly a copy would do as a trap: it should fit between its streets, and its houses should differ,
     or its mirror image would be itself."""
     wider = (source[2] - source[0]) - (target[2] - target[0])
-    x0, y0, x1, y1 = source
-    looks = {b.detail_u for b in town_of(options).plan.buildings if x0 < b.x < x1 and y0 < b.y < y1}
+    looks = {b.detail_u for b in town_of(options).plan.buildings if lies_in(source, b.x, b.y)}
     return (100.0 if wider > 4.0 else abs(wider)) - 4.0 * min(len(looks), 6)
-
-
-def _covers(outer: Rect, block: Rect) -> bool:
-    """Whether the middle of a block lies in the survey."""
-    x, y = 0.5 * (block[0] + block[2]), 0.5 * (block[1] + block[3])
-    return outer[0] <= x <= outer[2] and outer[1] <= y <= outer[3]
 
 
 def poison_album(options: PoisonOptions) -> list[PlannedPhoto]:
@@ -215,22 +196,18 @@ def _poisoned(photo: PlannedPhoto, home: Scene, places: Places, rng: np.random.G
     if kind == "altered":
         return replace(photo, edits=(_EDITS[int(rng.integers(len(_EDITS)))],))
     if kind == "lookalike" and photo.fact.visit % 2 == 0:
-        shift = [0.5 * (a + b - c - d) for a, b, c, d in [(*places.source[::2], *places.target[::2])]]
-        at = center + home.enu_from_town @ np.array([shift[0], 0.0, 0.0])
-        return _claiming(photo, geotag_at(home, at, 0.0, 8.0))
+        shift = 0.5 * (sum(places.source[::2]) - sum(places.target[::2]))
+        at = center + home.enu_from_town @ np.array([shift, 0.0, 0.0])
+        return replace(photo, geotag=geotag_at(home, at, 0.0, 8.0), exif="full")
     if kind == "liar":
         far = photo.fact.visit % 3 == 2
         at = center + np.array([*_LIE_M, 0.0]) * (30.0 if far else 1.0)
-        return _claiming(photo, geotag_at(home, at, 0.0, 5.0))
-    if kind == "liar_other":
+    elif kind == "liar_other":
         spot = rng.uniform(places.mapped[:2], places.mapped[2:])
         at = home.enu_from_town @ np.array([*spot, 40.0])
-        return _claiming(photo, geotag_at(home, at, 0.0, 5.0))
-    return photo
-
-
-def _claiming(photo: PlannedPhoto, tag: Geotag) -> PlannedPhoto:
-    return replace(photo, geotag=tag, exif="full")
+    else:
+        return photo
+    return replace(photo, geotag=geotag_at(home, at, 0.0, 5.0), exif="full")
 
 
 def blocks_of(plan: GroundPlan) -> list[Rect]:
@@ -267,7 +244,7 @@ def with_copied_block(scene: Scene, source: Rect, target: Rect, *, mirrored: boo
     face_at = _object_centers(faces)
     fixed = np.isin(faces.texture, [texture_index(t) for t in _GROUND_TEXTURES])
     kept, taken = fixed | ~_inside(face_at, cleared), ~fixed & _inside(face_at, source)
-    copy = _moved(_rows(faces, taken), sign, start)
+    copy = _moved(faces.take(taken), sign, start)
     patch = _ground_patch(scene.plan, source, shift, mirrored).shaded(scene.plan.to_sun)
     crowns = replace(scene.ellipsoids, center=scene.ellipsoids.center @ scene.enu_from_town)
     moved = _rows(crowns, _inside(crowns.center, source))
@@ -276,13 +253,13 @@ def with_copied_block(scene: Scene, source: Rect, target: Rect, *, mirrored: boo
     parts = (_rows(crowns, ~_inside(crowns.center, cleared)), moved)
     names = [field.name for field in fields(Ellipsoids)]
     trees = Ellipsoids(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-    houses = [b for b in scene.plan.buildings if not _inside(np.array([[b.x, b.y]]), cleared)[0]]
+    houses = [b for b in scene.plan.buildings if not lies_in(cleared, b.x, b.y)]
     houses += [
         replace(b, x=sign * b.x + start, yaw_deg=180.0 - b.yaw_deg if mirrored else b.yaw_deg)
         for b in scene.plan.buildings
-        if _inside(np.array([[b.x, b.y]]), source)[0]
+        if lies_in(source, b.x, b.y)
     ]
-    all_faces = Faces.concatenate([_rows(faces, kept), copy, patch])
+    all_faces = Faces.concatenate([faces.take(kept), copy, patch])
     return replace(
         scene,
         plan=replace(scene.plan, buildings=tuple(houses)),
@@ -327,16 +304,13 @@ def _object_centers(faces: Faces) -> FloatArray:
     return np.asarray((sums / np.bincount(row)[:, None])[row])
 
 
-def _rows(things: T, rows: NDArray[np.bool_]) -> T:
-    return type(things)(**{field.name: getattr(things, field.name)[rows] for field in fields(things)})
+def _rows(crowns: Ellipsoids, rows: NDArray[np.bool_]) -> Ellipsoids:
+    return Ellipsoids(**{field.name: getattr(crowns, field.name)[rows] for field in fields(crowns)})
 
 
 def _moved(faces: Faces, sign: float, start: float) -> Faces:
-    """The faces of which x becomes sign x + start.
-
-    A mirrored face has its edges exchanged, so that its outside stays outside; the texture is printed
-    the wrong way round.
-    """
+    """The faces of which x becomes sign x + start; mirrored ones with their edges exchanged, so that the
+    outside stays outside, and the texture printed the wrong way round."""
     flip = np.array([sign, 1.0, 1.0])
     moved = replace(
         faces, origin=faces.origin * flip + [start, 0.0, 0.0], object_id=faces.object_id + _ID_SHIFT

@@ -11,13 +11,8 @@ _DONE = "scan_world.done"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScanWorld:
-    """A world on disk.
-
-    Attributes:
-        world: photos and their truth.
-        scan: of the photos' town, LAZ with intensity only.
-        other_scan: of another town at the same place on Earth: nothing registers to it.
-    """
+    """A world on disk: photos and their truth; a LAZ of their town with intensity only; and one of another
+    town at the same place on Earth, to which nothing registers."""
 
     world: World
     scan: Path

@@ -22,8 +22,7 @@ class Sight:
     """Something that people photograph, in town axes, metres.
 
     Attributes:
-        target: what they aim at. radius: half its size.
-        weight: popularity.
+        target: what they aim at. radius: half its size. weight: popularity.
         stands: eye positions from which it is seen from the ground.
     """
 
@@ -108,8 +107,9 @@ def find_sights(
     return sights
 
 
-def _inside(point: tuple[float, float, float], rect: Rect) -> bool:
-    return rect[0] <= point[0] <= rect[2] and rect[1] <= point[1] <= rect[3]
+def lies_in(rect: Rect, x: float, y: float) -> bool:
+    """Whether a place is in a rectangle, town axes."""
+    return rect[0] <= x <= rect[2] and rect[1] <= y <= rect[3]
 
 
 Target = tuple[tuple[float, float, float], float, float]
@@ -129,7 +129,7 @@ def _named_targets(scene: Scene, within: Rect | None, rng: np.random.Generator) 
         if s.along == "y":
             targets.append(((s.at, 0.5 * sum(scene.plan.river), 0.8), 8.0, 3.0))
     if within is not None:
-        targets, houses = ([t for t in those if _inside(t[0], within)] for those in (targets, houses))
+        targets, houses = ([t for t in those if lies_in(within, *t[0][:2])] for those in (targets, houses))
     picked = rng.permutation(len(houses))[: max(8, len(houses) // 10)]
     return targets + [houses[int(i)] for i in picked]
 
@@ -172,11 +172,8 @@ def _stands(
 def look_at(
     scene: Scene, eye: FloatArray, target: FloatArray, turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> Rigid3:
-    """Pose of a camera at `eye` that looks at `target`, both (3,) in town axes.
-
-    Args:
-        turn_deg: added to heading, pitch, roll.
-    """
+    """Pose of a camera at `eye` that looks at `target`, both (3,) in town axes; `turn_deg` is added to
+    heading, pitch, roll."""
     position = scene.enu_from_town @ eye
     view = scene.enu_from_town @ (np.asarray(target, dtype=np.float64) - eye)
     heading = float(np.degrees(np.arctan2(view[0], view[1])))
