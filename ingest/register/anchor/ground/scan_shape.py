@@ -206,7 +206,8 @@ class SolidFit:
 
     Attributes:
         local_from_own: similarity. placed: (n, 3) the points there. middle: (3,) of them.
-        off_m: (n,) distances of the points from the solid's planes. near_m: (n,) from its nearest point.
+        off_m: (n,) distances of the points from the solid's planes. near_m: (n,) from its nearest point;
+            infinite where none is within reach.
         normal, right: (7, 7) and (7,) equations of the left perturbation about `middle` that lessens
             `off_m`. by_walls: (7,) what a metre of all walls outwards adds to the right side.
     """
@@ -225,11 +226,13 @@ def laid(shape: ScanShape, own: FloatArray, local_from_own: Sim3, width_m: float
     """How points (n, 3) of a map lie on a scan's solid; `width_m` of the loss by which they are weighed."""
     placed = local_from_own.act(own)
     middle = placed.mean(axis=0)
-    near_m, index = (np.asarray(found) for found in shape.tree.query(placed))
+    reach_m = max(4.0 * width_m, _LEAST_REACH_M)  # a tree finds at once that nothing is near
+    near_m, index = (np.asarray(found) for found in shape.tree.query(placed, distance_upper_bound=reach_m))
+    index = np.where(np.isfinite(near_m), index, 0)  # of points that nothing is near, which count for nothing
     normals = shape.normals[index]
     off_m = np.einsum("ij,ij->i", normals, placed - shape.points[index])
     weight = 1.0 / (1.0 + np.square(off_m / width_m)) ** 2
-    weight = np.where(near_m < max(4.0 * width_m, _LEAST_REACH_M), weight, 0.0)
+    weight = np.where(np.isfinite(near_m), weight, 0.0)
     jacobian = np.einsum("ij,ijk->ik", normals, point_jacobian(placed - middle))
     return SolidFit(
         local_from_own=local_from_own,
