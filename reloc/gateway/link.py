@@ -1,9 +1,8 @@
-"""The way to the server: one Zenoh session for all threads, opened when needed and again when it is dead."""
+"""The way to the server: one Zenoh client for all threads, which connects with the first question."""
 
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TypeVar
 
 from featuredb.errors import ServiceError
@@ -12,109 +11,47 @@ from reloc.gateway.options import GatewayOptions
 
 _T = TypeVar("_T")
 
-# After a failed connection so long nobody tries again: a hundred requests do not wait one after another.
+# After a server was waited for in vain nobody waits so long: a hundred requests would, one after another.
 _PAUSE_S = 1.0
 
 
-@dataclass(slots=True, eq=False)
-class _Line:
-    """An open client, how many threads use it, and whether it is given up."""
-
-    client: Client
-    users: int = 0
-    retired: bool = False
-
-
 class Link:
-    """Asks the server, from any thread; a server that restarts is found again without a restart of ours."""
+    """Asks the server, from any thread; Zenoh itself connects again with one that has restarted."""
 
     def __init__(self, options: GatewayOptions) -> None:
-        self._options = options
-        self._lock = threading.Lock()  # of the fields below; held for moments
-        self._opening = threading.Lock()  # of the one that connects
-        self._line: _Line | None = None
+        self._client = Client(
+            options.connect,
+            options.database,
+            config_path=options.config_path,
+            connect_timeout_s=options.connect_timeout_s,
+        )
+        self._finding = threading.Lock()
         self._refusal: tuple[float, ServiceError] | None = None
-        self._closed = False
-        self.sessions = 0
 
     def ask(self, question: Callable[[Client], _T]) -> _T:
-        """The server's answer. If nobody answers any more, a new session is tried once.
+        """The server's answer. If nobody answers, or not yet, a server is looked for once.
 
         Raises:
             ServiceError: as of `reloc.client.Client`.
         """
         try:
-            return self._asked(question)
+            return question(self._client)
         except ServiceError as error:
-            if error.code != NO_SERVER or self._refused() is not None:
+            if error.code != NO_SERVER:
                 raise
-        return self._asked(question)
+        self._find()
+        return question(self._client)
 
     def close(self) -> None:
-        """Close the session when its last user is done."""
-        with self._lock:
-            self._closed = True
-            line = self._line
-        if line is not None:
-            self._retire(line)
+        """Close the session; nobody may ask any more."""
+        self._client.close()
 
-    def _asked(self, question: Callable[[Client], _T]) -> _T:
-        line = self._take()
-        try:
-            return question(line.client)
-        except ServiceError as error:
-            if error.code == NO_SERVER:
-                self._retire(line)
-            raise
-        finally:
-            with self._lock:
-                line.users -= 1
-                last = line.retired and line.users == 0
-            if last:
-                line.client.close()
-
-    def _take(self) -> _Line:
-        with self._opening:
-            with self._lock:
-                if self._line is not None:
-                    self._line.users += 1
-                    return self._line
-                if self._closed:
-                    raise ServiceError(NO_SERVER, "the gateway is stopping")
-            refusal = self._refused()
-            if refusal is not None:
-                raise ServiceError(refusal.code, refusal.message)
-            client = Client(
-                self._options.connect,
-                self._options.database,
-                config_path=self._options.config_path,
-                connect_timeout_s=self._options.connect_timeout_s,
-            )
-            try:
-                client.open()
-            except ServiceError as error:
-                with self._lock:
-                    self._refusal = (time.monotonic() + _PAUSE_S, error)
-                raise
-            with self._lock:
-                self._refusal = None
-                self._line = _Line(client, users=1)
-                self.sessions += 1
-                return self._line
-
-    def _refused(self) -> ServiceError | None:
-        """The failure to connect that still counts."""
-        with self._lock:
+    def _find(self) -> None:
+        with self._finding:
             if self._refusal is not None and time.monotonic() < self._refusal[0]:
-                return self._refusal[1]
-            return None
-
-    def _retire(self, line: _Line) -> None:
-        """Nobody takes it any more; whoever uses it last closes it."""
-        with self._lock:
-            line.retired = True
-            if self._line is line:
-                self._line = None
-            idle = line.users == 0
-        if idle:
-            line.client.close()
+                raise ServiceError(self._refusal[1].code, self._refusal[1].message)
+            try:
+                self._client.open()
+            except ServiceError as error:
+                self._refusal = (time.monotonic() + _PAUSE_S, error)
+                raise
