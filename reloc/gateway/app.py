@@ -6,19 +6,20 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
-from importlib import resources
+from pathlib import Path
 from typing import TypeVar
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4 as METRICS_TYPE
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
-from starlette.responses import JSONResponse
+from starlette.responses import FileResponse, JSONResponse
+from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from featuredb.errors import InvalidValueError, ServiceError
@@ -44,6 +45,7 @@ from reloc.gateway.geopose import (
 from reloc.gateway.intake import Intake, read_form
 from reloc.gateway.link import Link
 from reloc.gateway.options import GatewayOptions
+from reloc.listening import CLIENT_GONE
 from reloc.service.logs import fields
 from reloc.wire.query import ErrorCode, LocaliseReply, LocaliseWireRequest
 from reloc.wire.server import StatusReply
@@ -56,8 +58,6 @@ _T = TypeVar("_T")
 _STATUS_TIMEOUT_S = 2.0  # what a health check or a scrape may take; the server answers in a millisecond
 # The client gives up so much later than it tells the server to, so that the server's word arrives.
 _DEADLINE_MARGIN_S = 0.2
-# Of a client that has gone; nobody reads it, but the count of requests shows it (nginx's custom).
-_CLIENT_GONE = 499
 
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
@@ -69,7 +69,6 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-_MEDIA_TYPES = {"css": "text/css", "html": "text/html", "js": "text/javascript"}
 
 _NAME = "featuredb_gateway_"
 # A query takes 0.2 s and at most the timeout of 10 s; health and maps take milliseconds.
@@ -78,21 +77,13 @@ _BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.
 
 def add_phone_page(app: FastAPI, prefix: str) -> None:
     """`prefix`/phone, and its script and style below it; it asks `prefix`/localise as any client does."""
-    root = resources.files("reloc.gateway") / "assets"
-    files = {file.name: file.read_bytes() for file in root.iterdir()}
+    assets = Path(__file__).with_name("assets")
 
     @app.get(f"{prefix}/phone", include_in_schema=False)
     async def page() -> Response:
-        return _file("phone.html")
+        return FileResponse(assets / "phone.html", headers=_HEADERS)
 
-    @app.get(f"{prefix}/phone/{{name}}", include_in_schema=False)
-    async def asset(name: str) -> Response:
-        return _file(name)
-
-    def _file(name: str) -> Response:
-        if name not in files:
-            raise HTTPException(404, f"no file {name[:100]!r}")
-        return Response(files[name], media_type=_MEDIA_TYPES[name.rsplit(".", 1)[-1]], headers=_HEADERS)
+    app.mount(f"{prefix}/phone", StaticFiles(directory=assets))
 
 
 class Gateway:
@@ -137,7 +128,6 @@ class Gateway:
         except ServiceError as error:
             logger.info("no figures of the server: %s", error)
         yield GaugeMetricFamily(f"{_NAME}in_flight", "Photos in hand.", value=self.intake.in_flight)
-        yield CounterMetricFamily(f"{_NAME}sessions", "Zenoh sessions opened.", value=self.link.sessions)
         yield from status_metrics(status)
 
     def close(self) -> None:
@@ -273,7 +263,7 @@ def _add_failures(app: FastAPI) -> None:
 
     @app.exception_handler(ClientDisconnect)
     async def gone(request: Request, error: ClientDisconnect) -> Response:
-        return Response(status_code=_CLIENT_GONE)
+        return Response(status_code=CLIENT_GONE)
 
     @app.exception_handler(Exception)
     async def defect(request: Request, error: Exception) -> Response:
