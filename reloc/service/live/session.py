@@ -16,7 +16,12 @@ from reloc.service.live.frames import FrameAnswerer, FrameAsk
 from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
 from reloc.service.workers.area_files import LocaliserFiles
-from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
+from reloc.service.workers.process import (
+    WorkerDefectError,
+    WorkerEndedError,
+    WorkerLateError,
+    WorkerProcess,
+)
 from reloc.wire.query import ErrorCode, RequestError, bad_request, parse_attachment
 from reloc.wire.track import EndReason, TrackEvent, TrackFrame, TrackPose
 
@@ -107,17 +112,11 @@ class Follower:
         return pose.model_copy(update={"timings_ms": clock.milliseconds()})
 
     def _asked(self, process: WorkerProcess, frame: FrameAsk, data: bytes) -> TrackPose:
-        watch = threading.Timer(self._frame_s, process.kill)
-        watch.start()
         try:
-            return process.ask(frame, data, TrackPose)
-        except WorkerEndedError as error:
-            if self._stopped or not process.killed:
-                raise
+            return process.ask(frame, data, TrackPose, self._frame_s)
+        except WorkerLateError as error:
             text = f"the frame was not done within {self._frame_s:g} s; send smaller ones"
             raise RequestError(ErrorCode.DEADLINE, text) from error
-        finally:
-            watch.cancel()
 
     def _ready(self) -> WorkerProcess:
         """The process, a new one where it has ended, over the area in service."""

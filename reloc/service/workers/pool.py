@@ -14,11 +14,11 @@ from reloc.service.contributions.inbox import Inbox, contribution_of
 from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
-from reloc.service.queueing import PendingQuery, QueryQueue, deadline_error
+from reloc.service.queueing import PendingQuery, QueryQueue
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
 from reloc.service.workers.area_files import AreaFiles
-from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
+from reloc.service.workers.process import WorkerEndedError, WorkerLateError, WorkerProcess
 from reloc.wire.query import (
     ContributionReply,
     ErrorCode,
@@ -161,17 +161,15 @@ class WorkerPool:
         except RequestError as error:
             item.request_id = error.request_id or item.request_id
             item.refuse(error)
-        except WorkerEndedError as error:
-            with self._changed:
-                self._up.discard(process)
-            what = f"{error} on this query, which concerns no other; the server's log has it"
-            item.refuse(RequestError(ErrorCode.INTERNAL, f"{what} under request id {item.request_id}"))
+        except WorkerLateError:
+            item.refuse(item.deadline_error())
         except Exception as error:
-            trace = {"trace": str(error)} if isinstance(error, WorkerDefectError) else {}
-            told = fields("internal", request_id=item.request_id, **trace)
-            logger.exception("query failed", extra=told)
-            what = "the server failed on this query; its log says why"
-            item.refuse(RequestError(ErrorCode.INTERNAL, f"{what} under request id {item.request_id}"))
+            if item.answered:  # and the process ended since
+                return
+            logger.exception("query failed", extra=fields("internal", request_id=item.request_id))
+            what = error if isinstance(error, WorkerEndedError) else "the server failed"
+            text = f"{what} on this query, which concerns no other; the server's log says why"
+            item.refuse(RequestError(ErrorCode.INTERNAL, f"{text} under request id {item.request_id}"))
 
     def _localise(self, item: PendingQuery, process: WorkerProcess) -> None:
         clock = StageClock(start=item.received)
@@ -183,12 +181,8 @@ class WorkerPool:
             text = f"contribute: this server takes no contributions; {instead}"
             raise RequestError(ErrorCode.UNSUPPORTED, text)
         wished_s = (request.options.deadline_ms or math.inf) / 1e3
-        end = min(item.received + wished_s, time.perf_counter() + self._options.work_s)
-        if end < item.deadline:
-            item.deadline = end
-            _check_deadline(item)  # one that is over already must not end a process that has nothing in hand
-            item.watch()
-        _check_deadline(item)
+        work_end = time.perf_counter() + self._options.work_s
+        item.deadline = min(item.deadline, item.received + wished_s, work_end)
         data = item.bytes_of("payload")
         clock.lap("request")
         if item.answered:
@@ -196,10 +190,12 @@ class WorkerPool:
         name = self._namer.submit(candidate_id_of, data) if request.contribute else None
         process.open(self.published)
         asked = request.model_copy(update={"request_id": item.request_id})
-        reply = process.ask(asked, data, LocaliseReply)
+        left_s = item.deadline - time.perf_counter()
+        if left_s <= 0.0:
+            raise item.deadline_error()
+        reply = process.ask(asked, data, LocaliseReply, left_s)
         clock.lap("worker", reply.timings_ms)
         reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
-        _check_deadline(item)
         if name is None:
             item.answer(reply)
         else:
@@ -238,8 +234,3 @@ class WorkerPool:
                 self._inbox.cancel(place)
         if answered:
             self._inbox.submit(place, lambda: contribution_of(data, request, reply, received_at, owner))
-
-
-def _check_deadline(item: PendingQuery) -> None:
-    if time.perf_counter() >= item.deadline:
-        raise deadline_error(item)

@@ -65,6 +65,10 @@ class WorkerEndedError(Exception):
         super().__init__(f"the worker process ended with {how}")
 
 
+class WorkerLateError(Exception):
+    """The process took too long for a picture, and is killed."""
+
+
 class WorkerDefectError(Exception):
     """The picture met a defect; the message is the traceback in the worker."""
 
@@ -125,10 +129,11 @@ class WorkerProcess:
             raise self._ended() from error
         self._open = files
 
-    def ask(self, ask: object, data: bytes, reply: type[_Reply]) -> _Reply:
-        """What the process's answerer answers about an image file, read as `reply`.
+    def ask(self, ask: object, data: bytes, reply: type[_Reply], time_s: float) -> _Reply:
+        """What the process's answerer answers about an image file within the time, read as `reply`.
 
         Raises:
+            WorkerLateError: it took longer.
             RequestError: why there is no answer; TOO_LARGE where the process has ended for want of memory.
             WorkerEndedError: the process has ended otherwise.
             WorkerDefectError: a defect.
@@ -136,6 +141,9 @@ class WorkerProcess:
         try:
             self._connection.send(ask)
             self._connection.send_bytes(data)
+            if not self._connection.poll(time_s):
+                self.kill()
+                raise WorkerLateError
             answer = self._connection.recv_bytes()
         except (EOFError, OSError) as error:
             ended = self._ended()
