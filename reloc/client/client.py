@@ -2,9 +2,8 @@
 
 import random
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -15,7 +14,6 @@ from featuredb.errors import InvalidValueError, ServiceError
 from reloc.client.connection import (
     NO_SERVER,
     TIMEOUT,
-    EventStream,
     client_config,
     first_reply,
     name_in,
@@ -296,13 +294,6 @@ class Client:
                 pose = live.next(timeout_s=0.1)
         """
         return LiveTrack(self._session(), self._keys, self.name, camera, prior, timeout_s)
-
-    @contextmanager
-    def watch_events(self) -> Iterator[EventStream]:
-        """Within the block, what the server publishes: maps that come and go, reloads, its end."""
-        stream = EventStream()
-        with self._session().declare_subscriber(self._keys.of("events"), stream.receive):
-            yield stream
 
     def _session(self) -> zenoh.Session:
         if self._open_session is None:
