@@ -17,32 +17,26 @@ _CONFIDENCE_BASE, _CONFIDENCE_PER_LOG, _CONFIDENCE_PER_RIVAL = -4.46, 1.36, -2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptanceOptions:
-    """Where the line is, by right and wrong poses of a simulated town and of real photos.
+    """Where the line is, by right and wrong poses of a simulated town and of real photos."""
 
-    Attributes:
-        min_inliers: fewer are never believed.
-        min_log_nfa: smallest -log10 of the number of false alarms, see `log_nfa`.
-        min_coverage: smallest share of a 10x10 grid over the image that holds inliers.
-        min_agreement: smallest share of the parts of the image where the map should be seen that holds
-            inliers; a picture of the place inside another picture agrees in its own part only.
-        min_spread: smallest `spread` of a photo whose prior does not say where it was taken. A look-alike
-            that fills a part of a photo gives many inliers there and none beside it. Photos of a simulated
-            walk beyond the maps' reach, 116 and 601 m off, had 0.56 and 0.50 with 223 and 81 inliers; right
-            ones there 0.77 and more, in a town of look-alikes 0.62 and more. It costs right photos half of
-            which is covered by something else; they need a prior.
-        prior_tells_m: largest standard deviation of a prior that tells look-alikes apart; that the pose
-            agrees with it is asked of every prior.
-        rival_share: a pose elsewhere with this share of the winner's inliers makes the answer ambiguous.
-        settled_log_nfa: with that much evidence for a pose, places with far fewer votes are not tried.
-    """
-
-    min_inliers: int = 15
-    min_log_nfa: float = 20.0
-    min_coverage: float = 0.05
+    min_inliers: int = 15  # fewer are never believed
+    min_log_nfa: float = 20.0  # smallest -log10 of the number of false alarms, see `log_nfa`
+    min_coverage: float = 0.05  # smallest share of a 10x10 grid over the image that holds inliers
+    # Smallest share of the parts of the image where the map should be seen that holds inliers; a picture of
+    # the place inside another picture agrees in its own part only.
     min_agreement: float = 0.2
+    # Smallest `spread` of a photo whose prior does not say where it was taken. A look-alike that fills a part
+    # of a photo gives many inliers there and none beside it. Photos of a simulated walk beyond the maps'
+    # reach, 116 and 601 m off, had 0.56 and 0.50 with 223 and 81 inliers; right ones there 0.77 and more, in
+    # a town of look-alikes 0.62 and more. It costs right photos half of which is covered by something else;
+    # they need a prior.
     min_spread: float = 0.6
+    # Largest standard deviation of a prior that tells look-alikes apart; that the pose agrees with it is
+    # asked of every prior.
     prior_tells_m: float = 50.0
+    # A pose elsewhere with this share of the winner's inliers makes the answer ambiguous.
     rival_share: float = 0.6
+    # With that much evidence for a pose, places with far fewer votes are not tried.
     settled_log_nfa: float = 48.0
 
 

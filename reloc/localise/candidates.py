@@ -25,15 +25,11 @@ _FAR_BELOW_M = 100_000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class IndexedArea:
-    """An area and an index over its descriptors, and maybe those of other areas.
-
-    Attributes:
-        first: row of the index where the area's points begin.
-    """
+    """An area and an index over its descriptors, and maybe those of other areas."""
 
     area: Area
     index: DescriptorIndex
-    first: int = 0
+    first: int = 0  # row of the index where the area's points begin
 
     @classmethod
     def of(cls, maps: Sequence[FeatureMap]) -> "IndexedArea":
@@ -85,19 +81,12 @@ def usable_areas(areas: Sequence[IndexedArea], fingerprint: str) -> list[Indexed
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Cluster:
-    """Images of one area that see the same place.
+    """Images of one area that see the same place."""
 
-    Attributes:
-        area: where they are.
-        images: (i,) rows of the area's images.
-        points: (p,) rows of the area's points that they see.
-        score: votes above expectation, in standard deviations; infinity where all areas are tried anyway.
-    """
-
-    area: Area
-    images: NDArray[np.intp]
-    points: NDArray[np.int32]
-    score: float
+    area: Area  # where they are
+    images: NDArray[np.intp]  # (i,) rows of the area's images
+    points: NDArray[np.int32]  # (p,) rows of the area's points that they see
+    score: float  # votes above expectation, in standard deviations; infinity where all areas are tried anyway
 
 
 def find_clusters(

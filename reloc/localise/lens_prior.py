@@ -20,16 +20,12 @@ _SAME_LENS_RATE = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class QueryLensPrior:
-    """A normal distribution over a lens's parameters, each by itself, in the order of `lens_of`.
+    """A normal distribution over a lens's parameters, each by itself, in the order of `lens_of`."""
 
-    Attributes:
-        mean, sigma: (4,) of SIMPLE_RADIAL's parameters or (8,) of OPENCV's.
-        dilution: so many observations count as one against it: what lens models leave over is common to whole
-            photos.
-    """
-
+    # mean, sigma: (4,) of SIMPLE_RADIAL's parameters or (8,) of OPENCV's.
     mean: FloatArray
     sigma: FloatArray
+    # So many observations count as one against it: what lens models leave over is common to whole photos.
     dilution: float = 1.0
 
     def __post_init__(self) -> None:
@@ -50,28 +46,22 @@ class QueryLensPrior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensPriors:
-    """Standard deviations of what is known of a lens before the photo is looked at.
+    """Standard deviations of what is known of a lens before the photo is looked at."""
 
-    Attributes:
-        exif_focal_rel: EXIF focal lengths of well-behaved cameras are within 1 to 3 %, by rounding of the
-            35 mm equivalent mostly; wide, because cropped pictures and video-like modes miss by tens of
-            percent, and one photo alone has to get away from that.
-        unknown_focal_rel: without EXIF: a factor of two either way.
-        radial: k1 of consumer lenses is within a few hundredths, phones' wide lenses up to 0.1.
-        center_rel: principal points of consumer cameras lie within 1 % of the longer side of the middle.
-        whole_lens: OPENCV's parameters are estimated, and not SIMPLE_RADIAL's alone. What a lens has beyond
-            one radial coefficient leaves a pattern that passes for another focal length, and the covariance
-            knows nothing of it: photos of a drone's lens had errors of 0.39 m at the median and 3.2 m at
-            most, their squared normalised errors a mean of 66 where 3 is right; with whole lenses 0.17 m,
-            0.6 m and 4.4.
-        second_radial, tangential, aspect: k2; p1 and p2; the second focal length over the first, less one.
-    """
-
+    # EXIF focal lengths of well-behaved cameras are within 1 to 3 %, by rounding of the 35 mm equivalent
+    # mostly; wide, because cropped pictures and video-like modes miss by tens of percent, and one photo alone
+    # has to get away from that.
     exif_focal_rel: float = 0.15
-    unknown_focal_rel: float = 0.7
-    radial: float = 0.04
+    unknown_focal_rel: float = 0.7  # without EXIF: a factor of two either way
+    radial: float = 0.04  # k1 of consumer lenses is within a few hundredths, phones' wide lenses up to 0.1
+    # Principal points of consumer cameras lie within 1 % of the longer side of the middle.
     center_rel: float = 0.01
+    # OPENCV's parameters are estimated, and not SIMPLE_RADIAL's alone. What a lens has beyond one radial
+    # coefficient leaves a pattern that passes for another focal length, and the covariance knows nothing of
+    # it: photos of a drone's lens had errors of 0.39 m at the median and 3.2 m at most, their squared
+    # normalised errors a mean of 66 where 3 is right; with whole lenses 0.17 m, 0.6 m and 4.4.
     whole_lens: bool = True
+    # second_radial, tangential, aspect: k2; p1 and p2; the second focal length over the first, less one.
     second_radial: float = 0.04
     tangential: float = 0.001
     aspect: float = 0.001

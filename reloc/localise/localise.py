@@ -38,16 +38,12 @@ _OWN_POSITION_SIGMA_M = 20.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Localised:
-    """A result with what it was made of, for callers that go on from there.
-
-    Attributes:
-        best: the believed pose with its matches and area; None exactly where the result has no pose.
-        uncertainty: of that pose, measured part only, in the area's axes.
-    """
+    """A result with what it was made of, for callers that go on from there."""
 
     result: LocaliseResult
+    # The believed pose with its matches and area; None exactly where the result has no pose.
     best: PoseCandidate | None = None
-    uncertainty: PoseUncertainty | None = None
+    uncertainty: PoseUncertainty | None = None  # of that pose, measured part only, in the area's axes
 
 
 def localise(

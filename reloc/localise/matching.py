@@ -26,15 +26,10 @@ _PROPOSED = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Matches:
-    """Pairs of a query feature and a map point; no feature and no point of one map twice.
+    """Pairs of a query feature and a map point; no feature and no point of one map twice."""
 
-    Attributes:
-        feature: (m,) rows of the query's features.
-        point: (m,) rows of the area's points.
-    """
-
-    feature: NDArray[np.int64]
-    point: NDArray[np.int64]
+    feature: NDArray[np.int64]  # (m,) rows of the query's features
+    point: NDArray[np.int64]  # (m,) rows of the area's points
 
     def __len__(self) -> int:
         return len(self.feature)

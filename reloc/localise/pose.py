@@ -19,30 +19,18 @@ from reloc.wire.query import CameraSource
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseHypothesis:
-    """A pose with the matches that agree with it.
+    """A pose with the matches that agree with it."""
 
-    Attributes:
-        cam_from_local: area frame to camera.
-        camera: intrinsics, the focal length estimated where `camera_source` is exif or estimated.
-        inliers: (m,) bool over the matches that it was estimated from.
-        lens_prior: what was known of the lens beforehand, where it is estimated with the pose; None: it is
-            exact.
-    """
-
-    cam_from_local: Rigid3
-    camera: Camera
+    cam_from_local: Rigid3  # area frame to camera
+    camera: Camera  # intrinsics, the focal length estimated where `camera_source` is exif or estimated
     camera_source: CameraSource
-    inliers: NDArray[np.bool_]
+    inliers: NDArray[np.bool_]  # (m,) bool over the matches that it was estimated from
+    # What was known of the lens beforehand, where it is estimated with the pose; None: it is exact.
     lens_prior: QueryLensPrior | None = None
 
     @property
     def count(self) -> int:
         return int(self.inliers.sum())
-
-    @property
-    def focal_is_free(self) -> bool:
-        """Whether the focal length was looked for together with the pose."""
-        return self.camera_source in ("exif", "estimated")
 
 
 def estimate_pose(
@@ -188,17 +176,13 @@ def reprojection_errors(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseUncertainty:
-    """Covariance of a pose, measurement part.
+    """Covariance of a pose, measurement part."""
 
-    Attributes:
-        joint: (6 + n, 6 + n), area frame's axes: rotation of the camera (rad) before displacement of its
-            centre (m); R_true = R(dtheta) R, C_true = C + dC for world_from_cam = (R, C). Then the
-            parameters of the lens in the order of `lens_of`, where it was estimated, too; else n = 0.
-        residual_rms_px: of the inliers.
-    """
-
+    # (6 + n, 6 + n), area frame's axes: rotation of the camera (rad) before displacement of its centre (m);
+    # R_true = R(dtheta) R, C_true = C + dC for world_from_cam = (R, C). Then the parameters of the lens in
+    # the order of `lens_of`, where it was estimated, too; else n = 0.
     joint: FloatArray
-    residual_rms_px: float
+    residual_rms_px: float  # of the inliers
 
     @property
     def covariance(self) -> FloatArray:

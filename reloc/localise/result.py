@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import GeoPose, geopose_from_camera
@@ -17,81 +16,58 @@ from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.unplaced_map import OwnFrame
 from reloc.localise.lens_prior import QueryLensPrior
-from reloc.wire.query import CameraSource, InMapPose, Lineage, OwnPositionUse, Reason, RunnerUpPose
+from reloc.wire.query import (
+    CameraSource,
+    InlierPoints,
+    InMapPose,
+    Lineage,
+    OwnPositionUse,
+    Reason,
+    RunnerUpPose,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocaliseRequest:
-    """What is known of a query besides its pixels.
+    """What is known of a query besides its pixels."""
 
-    Attributes:
-        camera: intrinsics for the image's full size; None: see the next two.
-        camera_prior: how well its intrinsics are known, which are then estimated with the pose; None:
-            exactly.
-        camera_is_exact: the intrinsics are the true ones, and not lent by a map: they are estimated with the
-            pose within what the map's own lenses leave open, which has bent the map.
-        camera_key: EXIF make/model/size/focal key (featuredb.features.exif); a map's camera with the same
-            key lends its calibrated intrinsics.
-        film: of a film that does not name its camera, `featuredb.features.exif.read.unnamed_model`; the
-            lenses that maps have of its shots are tried.
-        exif_focal_px: focal length from EXIF in pixels, a start for the estimate; None: unknown.
-        prior: where the photo may have been taken; None: anywhere in the database.
-        own_position: where the photo itself says so, which may be wrong: it settles what nothing else does,
-            and moves no answer. Beside `prior` it does not count.
-        beyond: a prior that was tried in vain; what it reaches is not tried again.
-        map_ids: only these maps; None: all active ones. A map without a place is named alone; it answers in
-            its own frame, and a prior does not count.
-        want_inliers: the answer carries pixels and UTM points of its inliers.
-    """
-
-    camera: Camera | None = None
+    camera: Camera | None = None  # intrinsics for the image's full size; None: see the next two
+    # How well its intrinsics are known, which are then estimated with the pose; None: exactly.
     camera_prior: QueryLensPrior | None = None
+    # The intrinsics are the true ones, and not lent by a map: they are estimated with the pose within what
+    # the map's own lenses leave open, which has bent the map.
     camera_is_exact: bool = False
+    # EXIF make/model/size/focal key (featuredb.features.exif); a map's camera with the same key lends its
+    # calibrated intrinsics.
     camera_key: str | None = None
+    # Of a film that does not name its camera, `featuredb.features.exif.read.unnamed_model`; the lenses that
+    # maps have of its shots are tried.
     film: str | None = None
+    # Focal length from EXIF in pixels, a start for the estimate; None: unknown.
     exif_focal_px: float | None = None
-    prior: GeoPrior | None = None
+    prior: GeoPrior | None = None  # where the photo may have been taken; None: anywhere in the database
+    # Where the photo itself says so, which may be wrong: it settles what nothing else does, and moves no
+    # answer. Beside `prior` it does not count.
     own_position: GeoPrior | None = None
-    beyond: GeoPrior | None = None
+    beyond: GeoPrior | None = None  # a prior that was tried in vain; what it reaches is not tried again
+    # Only these maps; None: all active ones. A map without a place is named alone; it answers in its own
+    # frame, and a prior does not count.
     map_ids: tuple[str, ...] | None = None
-    want_inliers: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Inliers:
-    """The matches that agree with the pose.
-
-    Attributes:
-        pixels: (k, 2) float64, keypoints of the query in full-size pixels.
-        points_utm: (k, 3) float64, easting, northing, height of the map points.
-        map_rows: (k,) int32, index into LocalisedPose.map_ids.
-    """
-
-    pixels: FloatArray
-    points_utm: FloatArray
-    map_rows: NDArray[np.int32]
+    want_inliers: bool = False  # the answer carries pixels and UTM points of its inliers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OnEarth:
-    """What every pose on Earth has.
+    """What every pose on Earth has; `..._68_m` and `..._68_deg` are radii that hold 68 % of the errors."""
 
-    Attributes:
-        epsg: UTM zone of `utm`, (3,) easting, northing, height of the camera centre, metres.
-        height_datum: datum of the heights, as the maps have it.
-        cam_from_utm_xyzw: (4,) rotation, grid axes (east, north, up) to camera axes.
-        geopose: the same as an OGC GeoPose.
-        covariance: (6, 6), axes true east-north-up at the camera: small rotation of the camera about those
-            axes (rad) before displacement of the camera centre (m). R_true = R(dtheta) R, C_true = C + dC.
-            Measurement noise scaled by the residuals, plus the map's own uncertainty.
-        horizontal_68_m, vertical_68_m, orientation_68_deg: radii that hold 68 % of the errors.
-    """
-
-    epsg: int
-    utm: FloatArray
-    height_datum: str
-    cam_from_utm_xyzw: FloatArray
-    geopose: GeoPose
+    epsg: int  # UTM zone
+    utm: FloatArray  # (3,) easting, northing, height of the camera centre, metres
+    height_datum: str  # datum of the heights, as the maps have it
+    cam_from_utm_xyzw: FloatArray  # (4,) rotation, grid axes (east, north, up) to camera axes
+    geopose: GeoPose  # the same as an OGC GeoPose
+    # (6, 6), axes true east-north-up at the camera: small rotation of the camera about those axes (rad)
+    # before displacement of the camera centre (m). R_true = R(dtheta) R, C_true = C + dC. Measurement noise
+    # scaled by the residuals, plus the map's own uncertainty.
     covariance: FloatArray
 
     def __post_init__(self) -> None:
@@ -125,29 +101,21 @@ def place_on_earth(frame: LocalFrame, cam_from_local: Rigid3, epsg: int) -> dict
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocalisedPose(OnEarth):
-    """The pose of a photo on Earth.
+    """The pose of a photo on Earth."""
 
-    Attributes:
-        frame: local ENU frame in which the pose was computed.
-        cam_from_local: pose, `frame` to camera axes (x right, y down, z forward), metres.
-        view_covariance: (6 + n, 6 + n) of the pose, as in `covariance`, and the camera's n parameters, for
-            what pixels show: pose and lens err together, mostly so that the map's points stay where they are
-            in the picture. None where the lens is exact: then it is `covariance`.
-        camera: intrinsics used, full image size.
-        map_ids: maps whose points are among the inliers, most inliers first.
-        lineage: for each of map_ids, what placed it; its steps, anchors, drift and budget only from a
-            `Localiser`, which knows the other maps, too (featuredb.maps.lineage).
-        residual_rms_px: of the inliers, in full-size pixels.
-    """
-
-    frame: LocalFrame
-    cam_from_local: Rigid3
-    camera: Camera
+    frame: LocalFrame  # local ENU frame in which the pose was computed
+    cam_from_local: Rigid3  # pose, `frame` to camera axes (x right, y down, z forward), metres
+    camera: Camera  # intrinsics used, full image size
     camera_source: CameraSource
-    map_ids: tuple[str, ...]
+    map_ids: tuple[str, ...]  # maps whose points are among the inliers, most inliers first
+    # For each of map_ids, what placed it; its steps, anchors, drift and budget only from a `Localiser`, which
+    # knows the other maps, too (featuredb.maps.lineage).
     lineage: tuple[Lineage, ...]
-    residual_rms_px: float
-    inliers: Inliers | None = None
+    residual_rms_px: float  # of the inliers, in full-size pixels
+    inliers: InlierPoints | None = None
+    # (6 + n, 6 + n) of the pose, as in `covariance`, and the camera's n parameters, for what pixels show:
+    # pose and lens err together, mostly so that the map's points stay where they are in the picture. None
+    # where the lens is exact: then it is `covariance`.
     view_covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
@@ -159,18 +127,13 @@ class LocalisedPose(OnEarth):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OwnPose:
-    """A pose in the own frame of a map without a place; it says nothing of where on Earth that is.
-
-    Attributes:
-        map_id: of the map. frame: whether its unit is a metre, and whether its z is up.
-        cam_from_map: pose, own frame to camera axes (x right, y down, z forward), units of the frame.
-        covariance: (6, 6), axes of the own frame: small rotation of the camera about them (rad) before
-            displacement of the camera centre (units of the frame).
-    """
+    """A pose in the own frame of a map without a place; it says nothing of where on Earth that is."""
 
     map_id: str
-    frame: OwnFrame
-    cam_from_map: Rigid3
+    frame: OwnFrame  # whether its unit is a metre, and whether its z is up
+    cam_from_map: Rigid3  # pose, own frame to camera axes (x right, y down, z forward), units of the frame
+    # (6, 6), axes of the own frame: small rotation of the camera about them (rad) before displacement of the
+    # camera centre (units of the frame).
     covariance: FloatArray
 
     def __post_init__(self) -> None:
@@ -179,55 +142,38 @@ class OwnPose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """The figures behind a decision.
+    """The figures behind a decision."""
 
-    Attributes:
-        inliers: matches that agree with the pose.
-        log_nfa: -log10 of the expected number of as good poses among random matches.
-        coverage: share of a 10x10 grid over the image that holds inliers.
-        agreement: of the parts of the image where the map should be seen, the share that holds inliers.
-        spread: the same over the share that as many inliers would reach if they lay like the map's points.
-    """
-
-    inliers: int
-    log_nfa: float
-    coverage: float
-    agreement: float
+    inliers: int  # matches that agree with the pose
+    log_nfa: float  # -log10 of the expected number of as good poses among random matches
+    coverage: float  # share of a 10x10 grid over the image that holds inliers
+    agreement: float  # of the parts of the image where the map should be seen, the share that holds inliers
+    # The same over the share that as many inliers would reach if they lay like the map's points.
     spread: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocaliseResult:
-    """The answer to one query: a pose, or a reason why there is none. Never a fallback pose.
+    """The answer to one query: a pose, or a reason why there is none. Never a fallback pose."""
 
-    Attributes:
-        reason: None exactly when there is a pose, on Earth or in a map.
-        detail: one sentence for people.
-        pose: the accepted pose on Earth, or None.
-        in_map: the accepted pose in the own frame of a map without a place, which the request named, or None.
-        confidence: probability that the pose is right, in [0, 1]; 0 when not localised.
-        features, matches, inliers: counts: keypoints of the query, 2D-3D matches of the best cluster,
-            matches that agree with the best pose (also of a rejected one: evidence).
-        runner_up: the best other hypothesis, or None.
-        snapshot: version of the database that answered.
-        evidence: for the best pose, believed or not; None where no pose was found at all.
-        timings_ms: stage name -> milliseconds, in the order they ran, and their `total`.
-        own_position: what the request's own position did; None where it has none.
-    """
-
-    reason: Reason | None
-    detail: str
+    reason: Reason | None  # None exactly when there is a pose, on Earth or in a map
+    detail: str  # one sentence for people
+    # features, matches, inliers: counts: keypoints of the query, 2D-3D matches of the best cluster, matches
+    # that agree with the best pose (also of a rejected one: evidence).
     features: int
     matches: int
     inliers: int
-    snapshot: int
-    pose: LocalisedPose | None = None
-    confidence: float = 0.0
-    runner_up: RunnerUpPose | None = None
+    snapshot: int  # version of the database that answered
+    pose: LocalisedPose | None = None  # the accepted pose on Earth, or None
+    confidence: float = 0.0  # probability that the pose is right, in [0, 1]; 0 when not localised
+    runner_up: RunnerUpPose | None = None  # the best other hypothesis, or None
+    # For the best pose, believed or not; None where no pose was found at all.
     evidence: Evidence | None = None
+    # Stage name -> milliseconds, in the order they ran, and their `total`.
     timings_ms: dict[str, float] = field(default_factory=dict)
+    # The accepted pose in the own frame of a map without a place, which the request named, or None.
     in_map: InMapPose | None = None
-    own_position: OwnPositionUse | None = None
+    own_position: OwnPositionUse | None = None  # what the request's own position did; None where it has none
 
     def __post_init__(self) -> None:
         said = [value is not None for value in (self.reason, self.pose, self.in_map)]
