@@ -131,10 +131,6 @@ def _query(args: argparse.Namespace) -> int:
     from reloc.client import Client
 
     camera, told = _told(args)
-    if args.contribute and not (args.credit and args.licence):
-        raise InvalidValueError(
-            "--contribute: expected --credit and --licence, too: whom to name with them, and the terms"
-        )
     require_an_image(args.image)
     with Client(args.connect, args.database, config_path=args.config) as client:
 

@@ -32,37 +32,22 @@ _RINGS, _SPOKES = (0.4, 0.8, 1.2, 1.6, 2.0, _REACH_SIGMAS), 12
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PixelPlace:
-    """What a pixel shows.
+    """What a pixel shows."""
 
-    Attributes:
-        pixel: (u, v) of the photo's stored pixels.
-        reason: why there is no place; None where there is one.
-        detail: one sentence for people: the reason, or what makes the place doubtful.
-        at_edge: another surface lies within the pixel's error; the covariance covers both.
-        grazing: the surface is seen at more than 80 degrees off its normal.
-        surface: "scan" or "map".
-        epsg: UTM zone. utm: (3,) easting, northing, height, metres.
-        height_datum: of the height.
-        lat_lon_h: (3,) degrees, metres.
-        covariance: (3, 3) true east, north, up there, square metres.
-        distance_m: from the camera. incidence_deg: between the ray and the surface's normal.
-        roughness_m: one standard deviation of the surface along its normal.
-    """
-
-    pixel: tuple[float, float]
-    reason: LocateReason | None
-    detail: str
-    epsg: int
-    height_datum: str
-    surface: str
-    at_edge: bool = False
-    grazing: bool = False
-    utm: FloatArray | None = None
-    lat_lon_h: FloatArray | None = None
-    covariance: FloatArray | None = None
-    distance_m: float | None = None
-    incidence_deg: float | None = None
-    roughness_m: float | None = None
+    pixel: tuple[float, float]  # (u, v) of the photo's stored pixels
+    reason: LocateReason | None  # why there is no place; None where there is one
+    detail: str  # one sentence for people: the reason, or what makes the place doubtful
+    epsg: int  # UTM zone
+    height_datum: str  # of the height
+    surface: str  # "scan" or "map"
+    at_edge: bool = False  # another surface lies within the pixel's error; the covariance covers both
+    grazing: bool = False  # the surface is seen at more than 80 degrees off its normal
+    utm: FloatArray | None = None  # (3,) easting, northing, height, metres
+    lat_lon_h: FloatArray | None = None  # (3,) degrees, metres
+    covariance: FloatArray | None = None  # (3, 3) true east, north, up there, square metres
+    distance_m: float | None = None  # from the camera
+    incidence_deg: float | None = None  # between the ray and the surface's normal
+    roughness_m: float | None = None  # one standard deviation of the surface along its normal
 
     @property
     def horizontal_68_m(self) -> float | None:

@@ -37,21 +37,13 @@ _MOST_POINTS = 80
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Patch:
-    """A piece of surface.
+    """A piece of surface."""
 
-    Attributes:
-        point: (3,) on it, nearest to the place that was asked for.
-        normal: (3,) unit vector, towards the viewer.
-        scatter_m: standard deviation of the points off the plane, metres.
-        fitted_m: how well they determine the plane there, along its normal: one standard deviation.
-        share: of the points around that lie on it.
-    """
-
-    point: FloatArray
-    normal: FloatArray
-    scatter_m: float
-    fitted_m: float
-    share: float
+    point: FloatArray  # (3,) on it, nearest to the place that was asked for
+    normal: FloatArray  # (3,) unit vector, towards the viewer
+    scatter_m: float  # standard deviation of the points off the plane, metres
+    fitted_m: float  # how well they determine the plane there, along its normal: one standard deviation
+    share: float  # of the points around that lie on it
 
 
 def fit_patch(points: FloatArray, near: FloatArray, viewer: FloatArray, tolerance_m: float) -> Patch | None:
@@ -140,33 +132,23 @@ def _patch(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Met:
-    """Where a ray meets a surface.
+    """Where a ray meets a surface."""
 
-    Attributes:
-        patch: the surface there.
-        sigma_m: one standard deviation of the surface along its normal.
-        spacing_m: distance between the points that it is known by; edges are known no better.
-        tolerance_m: what lies farther off the patch is another surface.
-        around: metres along the optical axis at pixels (k, 2) around; NaN where nothing is.
-    """
-
-    patch: Patch
-    sigma_m: float
-    spacing_m: float
-    tolerance_m: float
+    patch: Patch  # the surface there
+    sigma_m: float  # one standard deviation of the surface along its normal
+    spacing_m: float  # distance between the points that it is known by; edges are known no better
+    tolerance_m: float  # what lies farther off the patch is another surface
+    # Metres along the optical axis at pixels (k, 2) around; NaN where nothing is.
     around: Callable[[FloatArray], FloatArray]
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class ScanSurface:
-    """A cloud in the frame of the view; `doubt` is said of each place on it.
-
-    Attributes:
-        common_m: one standard deviation of what neighbouring points are off by together (their strip, the
-            datum), metres; None: half of how far they scatter.
-    """
+    """A cloud in the frame of the view; `doubt` is said of each place on it."""
 
     cloud: PointCloud
+    # One standard deviation of what neighbouring points are off by together (their strip, the datum), metres;
+    # None: half of how far they scatter.
     common_m: float | None = None
     kind: str = "scan"
     doubt: str = ""
@@ -255,12 +237,13 @@ class MapSurface:
             return "the map's points around lie on no surface"
         # Between points so far apart the surface may do what it does at them.
         sigma = float(np.hypot(patch.fitted_m, patch.scatter_m))
-        return Met(patch=patch, sigma_m=sigma, spacing_m=spacing, tolerance_m=tolerance, around=_nowhere)
-
-
-def _nowhere(pixels: FloatArray) -> FloatArray:
-    """A map's few points show no edges."""
-    return np.full(len(pixels), np.nan)
+        return Met(
+            patch=patch,
+            sigma_m=sigma,
+            spacing_m=spacing,
+            tolerance_m=tolerance,
+            around=lambda pixels: np.full(len(pixels), np.nan),  # so few points show no edges
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
