@@ -18,7 +18,7 @@ from reloc.service.queueing import PendingQuery, QueryQueue
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
 from reloc.service.workers.area_files import AreaFiles
-from reloc.service.workers.process import WorkerEndedError, WorkerLateError, WorkerProcess
+from reloc.service.workers.process import WorkerFailedError, WorkerProcess
 from reloc.wire.query import (
     ContributionReply,
     ErrorCode,
@@ -161,13 +161,11 @@ class WorkerPool:
         except RequestError as error:
             item.request_id = error.request_id or item.request_id
             item.refuse(error)
-        except WorkerLateError:
-            item.refuse(item.deadline_error())
         except Exception as error:
             if item.answered:  # and the process ended since
                 return
             logger.exception("query failed", extra=fields("internal", request_id=item.request_id))
-            what = error if isinstance(error, WorkerEndedError) else "the server failed"
+            what = error if isinstance(error, WorkerFailedError) else "the server failed"
             text = f"{what} on this query, which concerns no other; the server's log says why"
             item.refuse(RequestError(ErrorCode.INTERNAL, f"{text} under request id {item.request_id}"))
 
@@ -188,12 +186,11 @@ class WorkerPool:
         if item.answered:
             return
         name = self._namer.submit(candidate_id_of, data) if request.contribute else None
-        process.open(self.published)
         asked = request.model_copy(update={"request_id": item.request_id})
         left_s = item.deadline - time.perf_counter()
         if left_s <= 0.0:
             raise item.deadline_error()
-        reply = process.ask(asked, data, LocaliseReply, left_s)
+        reply = process.ask(self.published, asked, data, LocaliseReply, left_s, item.deadline_error())
         clock.lap("worker", reply.timings_ms)
         reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
         if name is None:
