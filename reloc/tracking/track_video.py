@@ -1,8 +1,8 @@
 """A whole video: frames in, a trajectory out, and a film with the track drawn over it on request."""
 
 from collections import deque
-from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,6 +27,8 @@ from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 
+# Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
+_READ_ON = 4
 # Of pictures that wait, for their greys and, as 4:2:0, their colours: at 3840x2160 ten frames.
 _MOST_BYTES = 1 << 27
 
@@ -77,24 +79,25 @@ def _words(point: TrajectoryPoint) -> list[str]:
     ]
 
 
-def read_ahead(video: Video, most: int = 24) -> Generator[VideoFrame, None, None]:
+def read_ahead(
+    video: Video, idle: Callable[[], bool] = lambda: True, most: int = 24
+) -> Generator[VideoFrame, None, None]:
     """The frames of an open film, in order; what goes wrong as they are read is raised at its frame.
 
-    A thread decodes at most so many before they are used, fewer where they are large. The film's `report`
-    knows of them. Live sources are not read ahead: what they show now is wanted.
+    While it is `idle` after a frame, a thread decodes further ones: up to `most`, fewer where they are large.
+    The film's `report` knows of them. Live sources are not read ahead: what they show now is wanted.
     """
     info, frames = video.info, iter(video)
     bytes_each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
     most = 0 if info.live else min(most, max(1, _MOST_BYTES // bytes_each))
-    if not most:
-        yield from frames
-        return
+    ahead: deque[Future[VideoFrame | None]] = deque()
     with ThreadPoolExecutor(1, thread_name_prefix="decoding") as pool:
-        ahead = deque(pool.submit(next, frames, None) for _ in range(most))
         try:
-            while (frame := ahead.popleft().result()) is not None:
-                ahead.append(pool.submit(next, frames, None))
+            # Nothing is decoded here while anything is there: frames stay in order.
+            while (frame := ahead.popleft().result() if ahead else next(frames, None)) is not None:
                 yield frame
+                wanted = min(_READ_ON, most - len(ahead)) if idle() else 0
+                ahead.extend(pool.submit(next, frames, None) for _ in range(wanted))
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -170,7 +173,7 @@ def track_video(
                     )
                 )
             first_s: float | None = None
-            frames = stack.enter_context(closing(read_ahead(video)))
+            frames = stack.enter_context(closing(read_ahead(video, lambda: not tracker.busy)))
             clock.lap("tracking")
             for frame in until_it_ends(frames, trouble):
                 clock.lap("waiting")

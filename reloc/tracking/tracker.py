@@ -123,6 +123,11 @@ class Tracker:
         self._send_keyframe(now, fitted, self._track)
         return self._known(now, state, fitted, self._track)
 
+    @property
+    def busy(self) -> bool:
+        """Whether the thread of the keyframes has one in hand."""
+        return self._sent is not None and not self._sent.answer.done()
+
     def use(self, finder: Finder) -> None:
         """Track by this finder's ground from the next frame on.
 

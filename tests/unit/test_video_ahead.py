@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -41,12 +42,16 @@ class _Film(Video):
             yield frame
 
 
-def test_frames_are_those_of_the_film(tmp_path: Path) -> None:
+@pytest.mark.parametrize("pattern", [(False,), (True,), (False, True, False, False)])
+def test_frames_are_those_of_the_film_whenever_they_are_read_ahead(
+    tmp_path: Path, pattern: tuple[bool, ...]
+) -> None:
+    idle = cycle(pattern)
     path = film(tmp_path, "mp4", 50)
     expected = read(path)
     with open_video(path) as video:
         found = []
-        for frame in read_ahead(video):
+        for frame in read_ahead(video, lambda: next(idle)):
             found.append(frame)
             # Colours are made here while greys are made there.
             np.testing.assert_array_equal(frame.rgb(), expected[len(found) - 1].rgb())
@@ -88,14 +93,15 @@ def test_large_films_are_read_ahead_as_far_as_their_memory_goes(
     source.info = replace(
         source.info, width=width, height=height, frame_width=small[0], frame_height=small[1]
     )
-    frames = read_ahead(source)
-    next(frames)
+    frames, used = read_ahead(source), 12
+    for _ in range(used):
+        next(frames)
     end = time.monotonic() + 20.0
-    while source.read < 1 + most:
+    while source.read < used + most - 1:  # the last one is in use
         assert time.monotonic() < end
         time.sleep(0.01)
     time.sleep(0.05)
-    assert source.read == 1 + most
+    assert source.read == used + most - 1
     frames.close()
 
 
