@@ -249,9 +249,7 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
         try:
             data = path.read_bytes()
             reply, _ = ask(data, None, True)
-        except (OSError, FeatureDbError) as error:
-            if isinstance(error, ServiceError) and error.code == "NO_SERVER":
-                break
+        except (OSError, FeatureDbError):
             continue  # said when it is asked for again
         if reply.camera is not None:
             exif = read_exif(data)

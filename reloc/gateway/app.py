@@ -119,7 +119,7 @@ class Gateway:
         )
         self.registry.register(Figures(self._figures))
         # Their own: routes that ask for figures have Starlette's, and an overrun server says how it is.
-        self._photos = ThreadPoolExecutor(options.workers, thread_name_prefix="gateway-photo")
+        self._photos = ThreadPoolExecutor(options.max_in_flight, thread_name_prefix="gateway-photo")
 
     async def in_thread(self, work: Callable[[], _T]) -> _T:
         """Run blocking work on a photo."""

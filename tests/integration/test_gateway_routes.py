@@ -256,7 +256,7 @@ def test_options_that_make_no_sense_are_refused():
         {"prefix": "/vps/"},
         {"port": 70_000},
         {"timeout_s": 0.0},
-        {"workers": 0},
+        {"max_in_flight": 0},
     ):
         with pytest.raises(InvalidValueError, match=next(iter(wrong))):
             GatewayOptions(**wrong)

@@ -4,7 +4,6 @@ import logging
 import math
 import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 
@@ -44,8 +43,6 @@ class WorkerPool:
         self._limits = options.worker_limits
         self._answerer = partial(answer_query, limits=options.limits)
         self._files = AreaFiles()
-        # A photo is named while it is localised: the query does not wait for a hash of its megabytes.
-        self._namer = ThreadPoolExecutor(1, thread_name_prefix="name-photo")
         self._busy: dict[PendingQuery, WorkerProcess | None] = {}
         self._up: set[WorkerProcess] = set()
         self._failed: dict[str, str] = {}  # why a worker's latest process did not come up, by its thread
@@ -98,7 +95,6 @@ class WorkerPool:
         self._closing.set()
         for thread in self._threads:
             thread.join(max(0.0, end - time.perf_counter()))
-        self._namer.shutdown(wait=False, cancel_futures=False)
         with self._changed:
             return list(self._busy)
 
@@ -185,7 +181,6 @@ class WorkerPool:
         clock.lap("request")
         if item.answered:
             return
-        name = self._namer.submit(candidate_id_of, data) if request.contribute else None
         asked = request.model_copy(update={"request_id": item.request_id})
         left_s = item.deadline - time.perf_counter()
         if left_s <= 0.0:
@@ -193,10 +188,10 @@ class WorkerPool:
         reply = process.ask(self.published, asked, data, LocaliseReply, left_s, item.deadline_error())
         clock.lap("worker", reply.timings_ms)
         reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
-        if name is None:
-            item.answer(reply)
+        if request.contribute:
+            self._answer_and_keep(item, data, request, reply, clock)
         else:
-            self._answer_and_keep(item, data, request, reply, clock, name)
+            item.answer(reply)
 
     def _answer_and_keep(
         self,
@@ -205,7 +200,6 @@ class WorkerPool:
         request: LocaliseWireRequest,
         reply: LocaliseReply,
         clock: StageClock,
-        name: Future[str],
     ) -> None:
         """Answer, and hand the photo to the inbox if it has a place; what the answer says is then done."""
         assert self._inbox is not None
@@ -223,9 +217,8 @@ class WorkerPool:
             return
         answered = False
         try:
-            queued = "queued for the inbox"
-            said = ContributionReply(accepted=True, candidate_id=name.result(), reason=None, detail=queued)
-            answered = answer(said)
+            name, queued = candidate_id_of(data), "queued for the inbox"
+            answered = answer(ContributionReply(accepted=True, candidate_id=name, reason=None, detail=queued))
         finally:
             if not answered:
                 self._inbox.cancel(place)
