@@ -47,37 +47,32 @@ class Identity:
     @classmethod
     def authority(cls) -> "Identity":
         """An authority, which signs the certificates of others and nothing else."""
-        extensions = (x509.BasicConstraints(ca=True, path_length=0), _usage(signs_certificates=True))
-        return _identity("featuredb authority", None, extensions)
+        return _identity("featuredb authority", None)
 
     def server(self, name: str, hosts: tuple[str, ...]) -> "Identity":
         """A server's, signed by this authority; clients that connect to another host refuse it."""
         uses = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         names = x509.SubjectAlternativeName([_host(host) for host in hosts])
-        return _identity(name, self, _of_others(), (x509.ExtendedKeyUsage(uses), names))
+        return _identity(name, self, x509.ExtendedKeyUsage(uses), names)
 
     def client(self, name: str) -> "Identity":
         """A client's, signed by this authority; it cannot be a server's."""
-        uses = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH])
-        return _identity(name, self, _of_others(), (uses,))
+        return _identity(name, self, x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH]))
 
 
-def _identity(
-    name: str,
-    signer: Identity | None,  # None: it signs its own
-    critical: tuple[x509.ExtensionType, ...],
-    others: tuple[x509.ExtensionType, ...] = (),
-) -> Identity:
-    """A new key, and a certificate of it."""
-    key = ec.generate_private_key(ec.SECP256R1())
+def _identity(name: str, signer: Identity | None, *uses: x509.ExtensionType) -> Identity:
+    """A new key, and a certificate of it; without a signer that of an authority, which signs its own."""
+    key = signing = ec.generate_private_key(ec.SECP256R1())
     issuer = own = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    signing = key
     if signer is not None:
         issuer = x509.load_pem_x509_certificate(signer.certificate).subject
         loaded = serialization.load_pem_private_key(signer.key, password=None)
         assert isinstance(loaded, ec.EllipticCurvePrivateKey)
         signing = loaded
-    now = datetime.now(UTC)
+    now, is_authority = datetime.now(UTC), signer is None
+    signs = {"digital_signature": not is_authority, "key_cert_sign": is_authority, "crl_sign": is_authority}
+    others = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement")
+    never = dict.fromkeys((*others, "encipher_only", "decipher_only"), False)
     builder = (
         x509.CertificateBuilder()
         .subject_name(own)
@@ -86,27 +81,17 @@ def _identity(
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - _CLOCKS_DIFFER)
         .not_valid_after(now + _VALID)
+        .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)
+        .add_extension(x509.KeyUsage(**signs, **never), critical=True)
     )
-    for extension in (*critical, *others):
-        builder = builder.add_extension(extension, critical=extension in critical)
+    for extension in uses:
+        builder = builder.add_extension(extension, critical=False)
     return Identity(
         certificate=builder.sign(signing, hashes.SHA256()).public_bytes(serialization.Encoding.PEM),
         key=key.private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         ),
     )
-
-
-def _of_others() -> tuple[x509.ExtensionType, ...]:
-    """Of who signs nobody's certificate."""
-    return x509.BasicConstraints(ca=False, path_length=None), _usage(signs_certificates=False)
-
-
-def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    signs = {"digital_signature": not signs_certificates}
-    signs |= dict.fromkeys(("key_cert_sign", "crl_sign"), signs_certificates)
-    encrypts = ("key_encipherment", "data_encipherment", "key_agreement", "encipher_only", "decipher_only")
-    return x509.KeyUsage(**signs, content_commitment=False, **dict.fromkeys(encrypts, False))
 
 
 def _host(host: str) -> x509.GeneralName:

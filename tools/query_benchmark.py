@@ -14,6 +14,7 @@ from statistics import median
 
 import cv2
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from featuredb.features.shrink import shrunk
 from featuredb.stage_clock import StageClock
@@ -23,7 +24,6 @@ from reloc.localiser import Localiser
 from reloc.service.handler import answer_query
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
-from reloc.service.workers.answering import capped_process
 from reloc.wire.query import LocaliseWireRequest, RequestOptions
 from tools.figures import study_parser, write_figures
 
@@ -38,13 +38,14 @@ def main() -> None:
     parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE")
     args = parser.parse_args()
     database = Database.open(args.db)
-    with capped_process(_THREADS):
-        localiser = Localiser.open(database)
-        direct = timed(lambda data: answer_query(_WITH_PRIOR, data, localiser), args.images)
-        options = ServeOptions(listen=("tcp/127.0.0.1:0",), threads_per_worker=_THREADS)
-        with start_server(database, options) as server, Client(server.endpoints[0]) as client:
-            ask = partial(client.localise, exif_prior=True, timeout_s=60.0)
-            served = timed(ask, args.images)
+    cv2.setNumThreads(_THREADS)
+    threadpool_limits(_THREADS)
+    localiser = Localiser.open(database)
+    direct = timed(lambda data: answer_query(_WITH_PRIOR, data, localiser), args.images)
+    options = ServeOptions(listen=("tcp/127.0.0.1:0",), threads_per_worker=_THREADS)
+    with start_server(database, options) as server, Client(server.endpoints[0]) as client:
+        ask = partial(client.localise, exif_prior=True, timeout_s=60.0)
+        served = timed(ask, args.images)
     figures = {name: median(one[name] for one in served) for name in served[0]}
     figures |= {"asked": len(served), "localised": sum(one["localised"] for one in served)}
     write_figures(args.json, figures | {"in_process_ms": median(one["wall_ms"] for one in direct)})

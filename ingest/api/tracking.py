@@ -59,9 +59,8 @@ class TrackedFilm:
             lines.append(f"  lost at the end or before: {summary['last_reason']}")
         seconds = summary["seconds"]
         lines.append(
-            f"  {summary['frames_per_s']} frames a second: {seconds['decoding']:.1f} s decoding, "
-            f"{seconds['tracking']:.1f} s tracking, {seconds['drawing']:.1f} s drawing; longest gap "
-            f"{1000 * seconds['longest_gap']:.0f} ms"
+            f"  {summary['frames_per_s']} frames a second: {seconds['tracking']:.1f} s tracking, "
+            f"{seconds['drawing']:.1f} s drawing, {seconds['waiting']:.1f} s waiting for frames"
         )
         if summary["frame"] == "own":
             lines.append("  poses are in the map's own frame, and say nothing of where on Earth that is")

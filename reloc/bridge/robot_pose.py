@@ -73,22 +73,12 @@ class RobotPose:
                 f"{type(error).__name__}: {error}"
             ) from error
 
-    def frame_here(self) -> LocalFrame:
-        """The local frame at the pose."""
-        return LocalFrame(latitude_deg=self.lat, longitude_deg=self.lon, height_m=self.height_m)
-
     def in_frame(self, frame: LocalFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Position (3,), body axes to the frame's (3, 3), and covariance (6, 6), in a local frame."""
         place = frame.enu_from_geodetic((self.lat, self.lon, self.height_m))
         turn = frame.true_enu_from_enu(place).T
         both = np.kron(np.eye(2), turn)
         return place, turn @ self.true_enu_from_body, both @ self.covariance @ both.T
-
-
-def warm_up() -> None:
-    """Let PROJ read its tables now: 50 ms that the first pose need not wait."""
-    frame = LocalFrame(latitude_deg=0.0, longitude_deg=0.0, height_m=0.0)
-    frame.true_enu_from_enu(frame.enu_from_geodetic((0.0, 0.0, 1.0)))
 
 
 def read_answers(
@@ -110,5 +100,7 @@ def read_answers(
             raise InvalidValueError(f"bridge: expected a JSON object a line, found {line!r:.80}") from error
         pose = RobotPose.of_answer(answer, mount, clock())
         if pose is not None:
-            origin = origin or pose.frame_here()
+            origin = origin or LocalFrame(
+                latitude_deg=pose.lat, longitude_deg=pose.lon, height_m=pose.height_m
+            )
             yield pose, origin

@@ -7,7 +7,9 @@
 import hashlib
 import struct
 import time
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
@@ -56,46 +58,44 @@ TOPICS = {
 }
 
 
-class McapLog:
-    """Writes the messages of poses into a file of ROS 2's profile; a context manager.
+Write = Callable[[RobotPose, LocalFrame], None]  # the three messages of a pose, in `map` at this origin
+
+
+@contextmanager
+def mcap_log(path: Path) -> Iterator[Write]:
+    """Within the block, writes the messages of poses into a new file of ROS 2's profile.
 
     Raises:
         MissingExtraError: mcap is not installed.
-        InvalidValueError: the file is there already, or cannot be written; raised when the block begins.
+        InvalidValueError: the file is there already, or cannot be written.
     """
+    require("robots", "The ROS 2 bridge", "mcap.writer")
+    from mcap.writer import Writer
 
-    def __init__(self, path: Path) -> None:
-        require("robots", "The ROS 2 bridge", "mcap.writer")
-        self._path = path
+    try:
+        file = path.open("xb")  # a recording is never made twice
+    except OSError as error:
+        raise InvalidValueError(
+            f"{path}: expected a new file in a folder that is there, found: {error.strerror}"
+        ) from error
+    with file:
+        writer: Any = Writer(file)
+        writer.start(profile="ros2", library="featuredb")
+        channels: dict[str, int] = {}
+        for topic, (name, definition) in TOPICS.items():
+            schema = writer.register_schema(name, "ros2msg", definition.encode())
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
 
-    def __enter__(self) -> Self:
-        from mcap.writer import Writer
+        def write(pose: RobotPose, origin: LocalFrame) -> None:
+            stamp_ns = _nanoseconds(pose.time_s)
+            for topic, data in messages(pose, origin).items():
+                times = {"log_time": stamp_ns, "publish_time": stamp_ns}
+                writer.add_message(channel_id=channels[topic], data=data, **times)
 
         try:
-            self._file = self._path.open("xb")  # a recording is never made twice
-        except OSError as error:
-            raise InvalidValueError(
-                f"{self._path}: expected a new file in a folder that is there, found: {error.strerror}"
-            ) from error
-        self._writer: Any = Writer(self._file)
-        self._writer.start(profile="ros2", library="featuredb")
-        self._channels: dict[str, int] = {}
-        for topic, (name, definition) in TOPICS.items():
-            schema = self._writer.register_schema(name, "ros2msg", definition.encode())
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
-        return self
-
-    def __exit__(self, *failed: object) -> None:
-        self._writer.finish()
-        self._file.close()
-
-    def write(self, pose: RobotPose, origin: LocalFrame) -> None:
-        """Add the three messages of a pose, in the frame `map` at this origin."""
-        stamp_ns = _nanoseconds(pose.time_s)
-        for topic, data in messages(pose, origin).items():
-            self._writer.add_message(
-                channel_id=self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=data
-            )
+            yield write
+        finally:
+            writer.finish()
 
 
 def messages(pose: RobotPose, origin: LocalFrame) -> dict[str, bytes]:
@@ -164,61 +164,52 @@ _GID_BYTES = 16
 _CONNECT_TIMEOUT_S = 5.0
 
 
-class RmwZenohNode:
-    """A node that publishes the messages of poses, in ROS_DOMAIN_ID `domain`; a context manager.
+@contextmanager
+def rmw_zenoh_node(connect: str, *, domain: int = 0) -> Iterator[Write]:
+    """Within the block, a node that publishes the messages of poses, in ROS_DOMAIN_ID `domain`.
 
     Raises:
-        InvalidValueError: nobody is at the endpoint, or it is none; raised when the block begins.
+        InvalidValueError: nobody is at the endpoint, or it is none.
     """
+    try:
+        session = zenoh.open(client_config(connect, _CONNECT_TIMEOUT_S))
+    except zenoh.ZError as error:
+        raise InvalidValueError(
+            f"--connect: expected the endpoint of ROS 2's Zenoh router (ros2 run rmw_zenoh_cpp "
+            f"rmw_zenohd), such as tcp/127.0.0.1:7447, found nobody at {connect}"
+        ) from error
+    with ExitStack() as opened:
+        opened.enter_context(session)
+        publishers, numbers = _declared(session, domain, opened), count(1)
 
-    def __init__(self, connect: str, *, domain: int = 0) -> None:
-        self._connect = connect
-        self._domain = domain
-        self._sent = 0
+        def write(pose: RobotPose, origin: LocalFrame) -> None:
+            number = Int64(next(numbers))
+            for topic, data in messages(pose, origin).items():
+                publisher, gid = publishers[topic]
+                publisher.put(data, attachment=z_serialize((number, Int64(time.time_ns()), gid)))
 
-    def __enter__(self) -> Self:
-        try:
-            session = zenoh.open(client_config(self._connect, _CONNECT_TIMEOUT_S))
-        except zenoh.ZError as error:
-            raise InvalidValueError(
-                f"--connect: expected the endpoint of ROS 2's Zenoh router (ros2 run rmw_zenoh_cpp "
-                f"rmw_zenohd), such as tcp/127.0.0.1:7447, found nobody at {self._connect}"
-            ) from error
-        with ExitStack() as opened:
-            opened.enter_context(session)
-            self._publishers = self._declared(session, opened)
-            self._open = opened.pop_all()
-        return self
+        yield write
 
-    def __exit__(self, *failed: object) -> None:
-        self._open.close()
 
-    def write(self, pose: RobotPose, origin: LocalFrame) -> None:
-        """Publish the three messages of a pose, in the frame `map` at this origin."""
-        self._sent += 1
-        for topic, data in messages(pose, origin).items():
-            publisher, gid = self._publishers[topic]
-            publisher.put(data, attachment=z_serialize((Int64(self._sent), Int64(time.time_ns()), gid)))
-
-    def _declared(self, session: zenoh.Session, opened: ExitStack) -> dict[str, tuple[Any, bytes]]:
-        """Tokens of the node and its publishers; of each topic its publisher and the id of that."""
-        own = f"@ros2_lv/{self._domain}/{session.zid()}/{_NODE_ID}"
-        place = f"%/%/{_NODE}"  # no enclave, no namespace
-        tokens = [f"{own}/{_NODE_ID}/NN/{place}"]
-        publishers = {}
-        for number, (topic, (kind, _)) in enumerate(TOPICS.items(), start=1):
-            package, name = kind.split("/msg/")
-            of_type = f"{package}::msg::dds_::{name}_/RIHS01_{_TYPE_HASHES[topic]}"
-            token = f"{own}/{number}/MP/{place}/{topic.replace('/', '%')}/{of_type}/{_QOS}"
-            # A message that the network has no room for is dropped: the next one is newer.
-            publisher = session.declare_publisher(
-                f"{self._domain}{topic}/{of_type}",
-                congestion_control=zenoh.CongestionControl.DROP,
-                express=True,
-            )
-            gid = hashlib.blake2b(token.encode(), digest_size=_GID_BYTES).digest()
-            publishers[topic] = (opened.enter_context(publisher), gid)
-            tokens.append(token)
-        for token in tokens:
-            opened.enter_context(session.liveliness().declare_token(token))
-        return publishers
+def _declared(session: zenoh.Session, domain: int, opened: ExitStack) -> dict[str, tuple[Any, bytes]]:
+    """Tokens of the node and its publishers; of each topic its publisher and the id of that."""
+    own = f"@ros2_lv/{domain}/{session.zid()}/{_NODE_ID}"
+    place = f"%/%/{_NODE}"  # no enclave, no namespace
+    tokens = [f"{own}/{_NODE_ID}/NN/{place}"]
+    publishers = {}
+    for number, (topic, (kind, _)) in enumerate(TOPICS.items(), start=1):
+        package, name = kind.split("/msg/")
+        of_type = f"{package}::msg::dds_::{name}_/RIHS01_{_TYPE_HASHES[topic]}"
+        token = f"{own}/{number}/MP/{place}/{topic.replace('/', '%')}/{of_type}/{_QOS}"
+        # A message that the network has no room for is dropped: the next one is newer.
+        publisher = session.declare_publisher(
+            f"{domain}{topic}/{of_type}",
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
+        )
+        gid = hashlib.blake2b(token.encode(), digest_size=_GID_BYTES).digest()
+        publishers[topic] = (opened.enter_context(publisher), gid)
+        tokens.append(token)
+    for token in tokens:
+        opened.enter_context(session.liveliness().declare_token(token))
+    return publishers

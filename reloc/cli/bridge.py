@@ -9,7 +9,7 @@ from featuredb.cli.common import numbers
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from featuredb.geo.local_frame import LocalFrame
     from reloc.bridge.robot_pose import RobotPose
@@ -70,27 +70,37 @@ def register(subparsers: Any) -> None:
         kind.set_defaults(run=run)
 
 
-def _poses(
-    args: argparse.Namespace, origin: "LocalFrame | None" = None
-) -> "Iterator[tuple[RobotPose, LocalFrame]]":
+def _passed_on(args: argparse.Namespace, *sends: "Callable[[RobotPose, LocalFrame], None]") -> int:
+    """How many poses of standard input were sent, each with its local frame."""
     import time
 
-    from reloc.bridge.robot_pose import read_answers, warm_up
+    from featuredb.geo.local_frame import LocalFrame
+    from reloc.bridge.robot_pose import read_answers
 
-    warm_up()
-    return read_answers(sys.stdin, args.mount, time.time, origin)
+    origin = None
+    if getattr(args, "origin", None) is not None:
+        origin = LocalFrame(
+            **dict(zip(("latitude_deg", "longitude_deg", "height_m"), args.origin, strict=True))
+        )
+    count = 0
+    for placed in read_answers(sys.stdin, args.mount, time.time, origin):
+        for send in sends:
+            send(*placed)
+        count += 1
+    return count
 
 
 def _mavlink(args: argparse.Namespace) -> int:
     from reloc.bridge.mavlink import MavlinkSender, UdpLink
 
     sender = MavlinkSender(args.message or ("odometry",), geoid_m=args.geoid)
-    origin, count = _origin(args.origin), 0
+
+    def send(pose: "RobotPose", origin: "LocalFrame") -> None:
+        for packet in sender.pack(pose, origin):
+            link.send(packet)
+
     with UdpLink(args.to) as link:
-        for placed in _poses(args, origin):
-            for packet in sender.pack(*placed):
-                link.send(packet)
-            count += 1
+        count = _passed_on(args, send)
     lost = f"; {link.lost} packets were not sent" if link.lost else ""
     return _said(f"{count} poses sent to {args.to}{lost}", count)
 
@@ -98,26 +108,19 @@ def _mavlink(args: argparse.Namespace) -> int:
 def _ros2(args: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
-    from reloc.bridge.ros2 import McapLog
+    from reloc.bridge.ros2 import Write, mcap_log, rmw_zenoh_node
 
     if args.out is None and args.connect is None:
         raise InvalidValueError("bridge ros2: expected --out FILE.mcap, --connect ENDPOINT or both")
     if not 0 <= args.domain <= _MOST_DOMAIN:
         raise InvalidValueError(f"--domain: expected 0 to {_MOST_DOMAIN}, found {args.domain}")
-    origin, count = _origin(args.origin), 0
     with ExitStack() as opened:
-        sinks: list[Callable[[RobotPose, LocalFrame], None]] = []
+        sinks: list[Write] = []
         if args.connect is not None:
-            from reloc.bridge.ros2 import RmwZenohNode
-
-            node = RmwZenohNode(args.connect, domain=args.domain)
-            sinks.append(opened.enter_context(node).write)
+            sinks.append(opened.enter_context(rmw_zenoh_node(args.connect, domain=args.domain)))
         if args.out is not None:  # begun once the router is there: nothing is overwritten for nothing
-            sinks.append(opened.enter_context(McapLog(args.out)).write)
-        for placed in _poses(args, origin):
-            for sink in sinks:
-                sink(*placed)
-            count += 1
+            sinks.append(opened.enter_context(mcap_log(args.out)))
+        count = _passed_on(args, *sinks)
     where = " and ".join(str(what) for what in (args.out, args.connect) if what is not None)
     return _said(f"{count} poses written to {where}", count)
 
@@ -125,22 +128,14 @@ def _ros2(args: argparse.Namespace) -> int:
 def _nmea(args: argparse.Namespace) -> int:
     from reloc.bridge.nmea import sentences
 
-    count = 0
-    for pose, _ in _poses(args):
+    def send(pose: "RobotPose", _: "LocalFrame") -> None:
         sys.stdout.write("".join(sentences(pose, args.geoid)))
         sys.stdout.flush()
-        count += 1
+
+    count = _passed_on(args, send)
     return _said(f"{count} poses", count)
 
 
 def _said(text: str, count: int) -> int:
     sys.stderr.write(text + "\n")
     return 0 if count else _NO_POSE
-
-
-def _origin(found: tuple[float, float, float] | None) -> "LocalFrame | None":
-    from featuredb.geo.local_frame import LocalFrame
-
-    if found is None:
-        return None
-    return LocalFrame(latitude_deg=found[0], longitude_deg=found[1], height_m=found[2])

@@ -38,16 +38,13 @@ def parse_camera(text: str | None, sigmas: str | None = None) -> CameraRequest |
     if sigmas is None:
         return camera
     try:
-        parsed = tuple(float(s) for s in sigmas.split(","))
-    except ValueError:
-        parsed = ()
-    count = len(camera.params)
-    if len(parsed) != count or not all(0 <= s < float("inf") for s in parsed):
+        parsed = tuple(float(s) for s, _ in zip(sigmas.split(","), params, strict=True))
+        return CameraRequest.model_validate({**dict(camera), "sigmas": parsed})
+    except (ValueError, ValidationError) as error:
         raise InvalidValueError(
-            f"--camera-sigmas: expected {count} numbers, 0 or more, one for each of --camera's parameters, "
-            f"found {sigmas!r}"
-        )
-    return camera.model_copy(update={"sigmas": parsed})
+            f"--camera-sigmas: expected {len(params)} numbers, 0 or more, one for each of --camera's "
+            f"parameters, found {sigmas!r}"
+        ) from error
 
 
 def as_arguments(camera: CameraRequest) -> str:

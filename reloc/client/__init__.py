@@ -1,7 +1,7 @@
 """Zenoh client of the relocalisation server."""
 
 from reloc.client.client import Client
-from reloc.client.connection import BAD_REPLY, NO_SERVER, TIMEOUT, EventStream
+from reloc.client.connection import BAD_REPLY, NO_SERVER, TIMEOUT
 from reloc.client.live import LiveTrack
 from reloc.wire.query import CameraRequest, LocaliseReply, PriorRequest
 from reloc.wire.track import TrackPose
@@ -12,7 +12,6 @@ __all__ = [
     "TIMEOUT",
     "CameraRequest",
     "Client",
-    "EventStream",
     "LiveTrack",
     "LocaliseReply",
     "PriorRequest",

@@ -2,9 +2,8 @@
 
 import random
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -15,7 +14,6 @@ from featuredb.errors import InvalidValueError, ServiceError
 from reloc.client.connection import (
     NO_SERVER,
     TIMEOUT,
-    EventStream,
     client_config,
     first_reply,
     name_in,
@@ -74,7 +72,7 @@ class Client:
         connect_timeout_s: float = 5.0,
     ) -> None:
         self._connect = connect
-        self._database = database
+        self._asked_for = self._database = database
         self._config_path = config_path
         self._connect_timeout_s = connect_timeout_s
         self._open_session: zenoh.Session | None = None
@@ -89,27 +87,31 @@ class Client:
         self.close()
 
     def open(self) -> None:
-        """Connect and wait until a server of the database is there.
+        """Connect and wait until a server of the database is there; the second call looks for one again.
 
         Raises:
             ServiceError: NO_SERVER, nobody at the endpoint, or no (or not exactly one) database.
         """
+        session = self._open_session or self._connected()
+        try:
+            self._database = wait_for_database(session, self._asked_for, self._where, self._connect_timeout_s)
+        except ServiceError:
+            if session is not self._open_session:
+                session.close()
+            raise
+        self._open_session = session
+
+    def _connected(self) -> zenoh.Session:
         try:
             if self._config_path is not None:
                 config = zenoh.Config.from_file(str(self._config_path))
                 self.name = name_in(config)
             else:
                 config = client_config(self._connect, self._connect_timeout_s)
-            session = zenoh.open(config)
+            return zenoh.open(config)
         except zenoh.ZError as error:
             asked = "is `featuredb serve` running, and is this its --listen endpoint?"
             raise ServiceError(NO_SERVER, f"nobody answers at {self._where}; {asked}") from error
-        try:
-            self._database = wait_for_database(session, self._database, self._where, self._connect_timeout_s)
-        except ServiceError:
-            session.close()
-            raise
-        self._open_session = session
 
     def close(self) -> None:
         """Disconnect; the second call does nothing."""
@@ -292,13 +294,6 @@ class Client:
                 pose = live.next(timeout_s=0.1)
         """
         return LiveTrack(self._session(), self._keys, self.name, camera, prior, timeout_s)
-
-    @contextmanager
-    def watch_events(self) -> Iterator[EventStream]:
-        """Within the block, what the server publishes: maps that come and go, reloads, its end."""
-        stream = EventStream()
-        with self._session().declare_subscriber(self._keys.of("events"), stream.receive):
-            yield stream
 
     def _session(self) -> zenoh.Session:
         if self._open_session is None:

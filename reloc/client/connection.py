@@ -1,7 +1,6 @@
 """How a client finds the servers of a database, and what they send, read."""
 
 import json
-import queue
 import time
 from typing import Any, TypeVar
 
@@ -11,7 +10,6 @@ from pydantic import BaseModel, ValidationError
 from featuredb.errors import ServiceError
 from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, Keys
 from reloc.wire.query import ErrorReply
-from reloc.wire.server import Event
 
 _ASK_AGAIN_S = 0.05  # while no server is there yet
 _Message = TypeVar("_Message", bound=BaseModel)
@@ -100,24 +98,3 @@ def _service_error(payload: bytes, timeout_s: float) -> ServiceError:
             return ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s")
         return ServiceError(BAD_REPLY, f"expected an error as JSON, found {payload[:200]!r}")
     return ServiceError(error.code, error.message, error.request_id)
-
-
-class EventStream:
-    """Events in the order in which they arrived."""
-
-    def __init__(self) -> None:
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-
-    def receive(self, sample: zenoh.Sample) -> None:
-        """Take one publication; what is no event is left out."""
-        try:
-            self._events.put(Event.model_validate_json(sample.payload.to_bytes()))
-        except ValidationError:
-            return
-
-    def next(self, timeout_s: float | None = None) -> Event | None:
-        """The next event; None when none came within the time."""
-        try:
-            return self._events.get(timeout=timeout_s)
-        except queue.Empty:
-            return None

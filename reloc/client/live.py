@@ -25,12 +25,16 @@ _SERVER_ANSWERS_S = 5.0
 
 
 class LiveTrack:
-    """One live session; a context manager. `Client.track` makes it.
+    """One live session; a context manager, open within the block. `Client.track` makes it.
 
     Frames are sent from one thread, and may be received in another. A frame that comes while the server has
     another one in hand waits for it, until a newer one takes its place: it is dropped then and has no pose.
-    `refusals` says why frames could not be used, the latest hundred.
+    `refusals` says why frames could not be used, the latest hundred. `opened`: what the server said of the
+    session, its limits and time-out.
     """
+
+    opened: TrackOpened
+    _frames: zenoh.Publisher
 
     def __init__(
         self,
@@ -48,9 +52,7 @@ class LiveTrack:
         self._key = keys.track(client, self.name)
         self._request = TrackOpenRequest(camera=camera, prior=prior)
         self._timeout_s = timeout_s
-        self._opened: TrackOpened | None = None
         self._declared = ExitStack()
-        self._frames: zenoh.Publisher | None = None
         self._next = 0
         self._changed = threading.Condition()
         self._poses: deque[TrackPose] = deque(maxlen=_KEPT)
@@ -60,13 +62,6 @@ class LiveTrack:
         self._latency_ms: OrderedDict[int, float] = OrderedDict()
 
     def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *failed: object) -> None:
-        self.close()
-
-    def open(self) -> None:
         """Ask the server for the session.
 
         Raises:
@@ -78,15 +73,16 @@ class LiveTrack:
             declared(session.declare_subscriber(f"{self._key}/{leaf}", Callback(callback, indirect=False)))
         declared(session.liveliness().declare_token(f"{self._key}/client"))
         try:
-            self._opened = first_reply(
+            opened = first_reply(
                 session, self._key, TrackOpened, self._timeout_s, attachment=encode(self._request)
             )
-            if self._opened is None:
+            if opened is None:
                 where = f"within {self._timeout_s:g} s at {self._key}"
                 raise ServiceError(TIMEOUT, f"no server opened a live session {where}")
         except ServiceError:
-            self.close()
+            self._declared.close()
             raise
+        self.opened = opened
         # A frame that the network has no room for is dropped: the next one is newer.
         self._frames = declared(
             session.declare_publisher(
@@ -94,23 +90,11 @@ class LiveTrack:
             )
         )
         self._heard = time.monotonic()
+        return self
 
-    def close(self) -> None:
-        """End the session; the second call does nothing. The server hears of it by the token that goes."""
-        self._frames = None
-        self._declared.close()
+    def __exit__(self, *failed: object) -> None:
         self._over(ServiceError("CLOSED", "the session was closed by this client"))
-
-    @property
-    def opened(self) -> TrackOpened:
-        """What the server said of the session: limits, time-out.
-
-        Raises:
-            ServiceError: NO_SERVER, it is not open.
-        """
-        if self._opened is None:
-            raise _not_open()
-        return self._opened
+        self._declared.close()  # the server hears of it by the token that goes
 
     def send(self, image: bytes, time_s: float, sequence: int | None = None) -> int:
         """Send a frame, without waiting for anything; its number.
@@ -123,17 +107,14 @@ class LiveTrack:
         Raises:
             ServiceError: the session is over; `code` says why.
         """
-        frames = self._frames
         if self._end is not None:
             raise self._end
-        if frames is None:
-            raise _not_open()
         sequence = self._next if sequence is None else sequence
         self._next = sequence + 1
         header = encode(TrackFrame(sequence=sequence, time_s=time_s))
         with self._changed:
             _remember(self._sent, sequence, time.perf_counter())
-        frames.put(image, attachment=header)
+        self._frames.put(image, attachment=header)
         return sequence
 
     def next(self, timeout_s: float | None = None) -> TrackPose | None:
@@ -218,10 +199,6 @@ class LiveTrack:
             self._over(ServiceError(event.code, event.message))
         else:
             self.refusals.append(event)
-
-
-def _not_open() -> ServiceError:
-    return ServiceError(NO_SERVER, "the session is not open; use it in a `with` block or call open()")
 
 
 def _remember(times: OrderedDict[int, float], sequence: int, value: float) -> None:

@@ -1,27 +1,30 @@
-"""The HTTP application: routes over a link to the server."""
+"""The HTTP application: routes, and the client of the server that they share."""
 
 import asyncio
 import logging
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
-from importlib import resources
+from pathlib import Path
 from typing import TypeVar
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4 as METRICS_TYPE
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
-from starlette.responses import JSONResponse
+from starlette.responses import FileResponse, PlainTextResponse
+from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from featuredb.errors import InvalidValueError, ServiceError
+from reloc.client import NO_SERVER, Client
 from reloc.gateway import openapi
 from reloc.gateway.failures import (
     METHOD_NOT_ALLOWED,
@@ -42,8 +45,8 @@ from reloc.gateway.geopose import (
     response_of,
 )
 from reloc.gateway.intake import Intake, read_form
-from reloc.gateway.link import Link
 from reloc.gateway.options import GatewayOptions
+from reloc.listening import CLIENT_GONE
 from reloc.service.logs import fields
 from reloc.wire.query import ErrorCode, LocaliseReply, LocaliseWireRequest
 from reloc.wire.server import StatusReply
@@ -53,11 +56,11 @@ logger = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
+# After a server was waited for in vain nobody waits so long: a hundred requests would, one after another.
+_PAUSE_S = 1.0
 _STATUS_TIMEOUT_S = 2.0  # what a health check or a scrape may take; the server answers in a millisecond
 # The client gives up so much later than it tells the server to, so that the server's word arrives.
 _DEADLINE_MARGIN_S = 0.2
-# Of a client that has gone; nobody reads it, but the count of requests shows it (nginx's custom).
-_CLIENT_GONE = 499
 
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
@@ -69,7 +72,6 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-_MEDIA_TYPES = {"css": "text/css", "html": "text/html", "js": "text/javascript"}
 
 _NAME = "featuredb_gateway_"
 # A query takes 0.2 s and at most the timeout of 10 s; health and maps take milliseconds.
@@ -78,29 +80,31 @@ _BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.
 
 def add_phone_page(app: FastAPI, prefix: str) -> None:
     """`prefix`/phone, and its script and style below it; it asks `prefix`/localise as any client does."""
-    root = resources.files("reloc.gateway") / "assets"
-    files = {file.name: file.read_bytes() for file in root.iterdir()}
+    assets = Path(__file__).with_name("assets")
 
     @app.get(f"{prefix}/phone", include_in_schema=False)
     async def page() -> Response:
-        return _file("phone.html")
+        return FileResponse(assets / "phone.html", headers=_HEADERS)
 
-    @app.get(f"{prefix}/phone/{{name}}", include_in_schema=False)
-    async def asset(name: str) -> Response:
-        return _file(name)
-
-    def _file(name: str) -> Response:
-        if name not in files:
-            raise HTTPException(404, f"no file {name[:100]!r}")
-        return Response(files[name], media_type=_MEDIA_TYPES[name.rsplit(".", 1)[-1]], headers=_HEADERS)
+    app.mount(f"{prefix}/phone", StaticFiles(directory=assets))
 
 
 class Gateway:
-    """What the routes share: the link to the server, threads to wait in, limits and counters."""
+    """What the routes share: a client of the server, threads to wait in, limits and counters.
+
+    The client connects with the first question. Zenoh itself connects again with a server that has restarted.
+    """
 
     def __init__(self, options: GatewayOptions) -> None:
         self.options = options
-        self.link = Link(options)
+        self._client = Client(
+            options.connect,
+            options.database,
+            config_path=options.config_path,
+            connect_timeout_s=options.connect_timeout_s,
+        )
+        self._finding = threading.Lock()
+        self._refusal: tuple[float, ServiceError] | None = None
         self.intake = Intake(options)
         self.registry = CollectorRegistry()
         self._requests = Counter(
@@ -115,14 +119,35 @@ class Gateway:
         )
         self.registry.register(Figures(self._figures))
         # Their own: routes that ask for figures have Starlette's, and an overrun server says how it is.
-        self._photos = ThreadPoolExecutor(options.workers, thread_name_prefix="gateway-photo")
+        self._photos = ThreadPoolExecutor(options.max_in_flight, thread_name_prefix="gateway-photo")
 
     async def in_thread(self, work: Callable[[], _T]) -> _T:
         """Run blocking work on a photo."""
         return await asyncio.get_running_loop().run_in_executor(self._photos, work)
 
+    def ask(self, question: Callable[[Client], _T]) -> _T:
+        """The server's answer, in any thread. If nobody answers, or not yet, a server is looked for once.
+
+        Raises:
+            ServiceError: as of `reloc.client.Client`.
+        """
+        try:
+            return question(self._client)
+        except ServiceError as error:
+            if error.code != NO_SERVER:
+                raise
+        with self._finding:
+            if self._refusal is not None and time.monotonic() < self._refusal[0]:
+                raise ServiceError(self._refusal[1].code, self._refusal[1].message)
+            try:
+                self._client.open()
+            except ServiceError as error:
+                self._refusal = (time.monotonic() + _PAUSE_S, error)
+                raise
+        return question(self._client)
+
     def status(self) -> StatusReply:
-        return self.link.ask(lambda client: client.status(timeout_s=_STATUS_TIMEOUT_S))
+        return self.ask(lambda client: client.status(timeout_s=_STATUS_TIMEOUT_S))
 
     def observe(self, route: str, status: int, seconds: float) -> None:
         """A request was answered."""
@@ -137,18 +162,17 @@ class Gateway:
         except ServiceError as error:
             logger.info("no figures of the server: %s", error)
         yield GaugeMetricFamily(f"{_NAME}in_flight", "Photos in hand.", value=self.intake.in_flight)
-        yield CounterMetricFamily(f"{_NAME}sessions", "Zenoh sessions opened.", value=self.link.sessions)
         yield from status_metrics(status)
 
     def close(self) -> None:
         self._photos.shutdown(wait=True, cancel_futures=True)
-        self.link.close()
+        self._client.close()
 
     def geopose(self, body: bytes) -> tuple[GeoPoseResp, str, str]:
         """The answer, the datum of its height, the request id."""
         request = parse(body)
         image, asked = question_of(request, self.options)
-        reply = self.link.ask(lambda client: client.ask(image, asked, self.options.timeout_s))
+        reply = self.ask(lambda client: client.ask(image, asked, self.options.timeout_s))
         return *response_of(request, reply), reply.request_id
 
     def localise(self, image: bytes, asked: LocaliseWireRequest) -> LocaliseReply:
@@ -157,7 +181,7 @@ class Gateway:
         if asked.options.deadline_ms is not None:
             deadline_s = asked.options.deadline_ms / 1e3
             timeout_s = min(timeout_s, deadline_s + min(deadline_s, _DEADLINE_MARGIN_S))
-        return self.link.ask(lambda client: client.ask(image, asked, timeout_s))
+        return self.ask(lambda client: client.ask(image, asked, timeout_s))
 
 
 def create_app(options: GatewayOptions) -> FastAPI:
@@ -211,9 +235,10 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
             headers={"Featuredb-Height-Datum": datum, "Featuredb-Request-Id": request_id},
         )
 
-    @app.get(f"{prefix}/geopose", **openapi.RUNNING)
-    async def running() -> Response:
-        return JSONResponse({"status": "running"})  # as the protocol's reference servers answer
+    @app.get(f"{prefix}/geopose")
+    async def running() -> dict[str, str]:
+        """The gateway runs, as the protocol's reference servers say it."""
+        return {"status": "running"}
 
     @app.post(f"{prefix}/localise", **openapi.LOCALISE)
     async def localise(request: Request) -> Response:
@@ -224,7 +249,7 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
 
     @app.get(f"{prefix}/maps", **openapi.MAPS)
     def maps() -> Response:
-        return _json(gateway.link.ask(lambda client: client.maps(timeout_s=_STATUS_TIMEOUT_S)))
+        return _json(gateway.ask(lambda client: client.maps(timeout_s=_STATUS_TIMEOUT_S)))
 
     @app.get(f"{prefix}/health", **openapi.HEALTH)
     def health() -> Response:
@@ -237,8 +262,9 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
             return _json(ErrorBody(code=NOT_READY, message=message), 503)
         return _json(openapi.Health(database=status.database, snapshot=status.snapshot, maps=status.maps))
 
-    @app.get(f"{prefix}/metrics", **openapi.METRICS)
+    @app.get(f"{prefix}/metrics", response_class=PlainTextResponse)
     def metrics() -> Response:
+        """Prometheus' text format."""
         return Response(generate_latest(gateway.registry), media_type=METRICS_TYPE)
 
     add_phone_page(app, prefix)
@@ -273,7 +299,7 @@ def _add_failures(app: FastAPI) -> None:
 
     @app.exception_handler(ClientDisconnect)
     async def gone(request: Request, error: ClientDisconnect) -> Response:
-        return Response(status_code=_CLIENT_GONE)
+        return Response(status_code=CLIENT_GONE)
 
     @app.exception_handler(Exception)
     async def defect(request: Request, error: Exception) -> Response:

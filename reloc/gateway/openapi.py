@@ -51,10 +51,6 @@ GEOPOSE: dict[str, Any] = {
     },
     "openapi_extra": _body("application/json", schema=_schema("GeoPoseReq")),
 }
-RUNNING: dict[str, Any] = {
-    "summary": "The gateway runs, as the protocol's reference servers say it",
-    "responses": {200: {"content": {"application/json": {"example": {"status": "running"}}}}},
-}
 _IMAGE = {"type": "string", "format": "binary", "description": "JPEG, HEIC, AVIF, PNG, WebP, TIFF, BMP"}
 _SAID = {"camera": "CameraRequest", "prior": "PriorRequest", "options": "RequestOptions"}
 LOCALISE: dict[str, Any] = {
@@ -93,10 +89,6 @@ HEALTH: dict[str, Any] = {
         200: {"model": Health},
         503: {"model": ErrorBody, "description": "NO_SERVER or any other code: none answers, and why"},
     },
-}
-METRICS: dict[str, Any] = {
-    "summary": "Prometheus' text format",
-    "responses": {200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 }
 
 

@@ -23,7 +23,6 @@ class GatewayOptions:
     prefix: str = ""  # stands before every path, such as "/vps"
     timeout_s: float = 10.0  # the longest wait for the server's answer to one photo; Zenoh's own default
     connect_timeout_s: float = 2.0  # the longest wait for a server to be there
-    workers: int = 8  # questions to the server at a time
     max_in_flight: int = 16  # photos in hand at a time, from the end of their bodies on
     max_body_bytes: int = 90 << 20  # of one request; images of 64 MiB are 85.4 MiB as base64
     max_image_bytes: int = 64 << 20  # of one image after base64, as the server takes them

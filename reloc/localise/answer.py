@@ -12,8 +12,8 @@ from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
 from reloc.localise.lens_prior import lens_for, lens_jacobians, lens_of, opencv_by_lens, pixel_jacobians
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
-from reloc.localise.result import Inliers, LocalisedPose, place_on_earth
-from reloc.wire.query import Lineage
+from reloc.localise.result import LocalisedPose, place_on_earth
+from reloc.wire.query import InlierPoints, Lineage
 
 _DAMPING = 1e-9
 
@@ -157,14 +157,18 @@ def _lineage(feature_map: FeatureMap) -> Lineage:
     )
 
 
-def _inliers(area: Area, order: list[int], pixels: FloatArray, point_rows: NDArray[np.int64]) -> Inliers:
+def _inliers(area: Area, order: list[int], pixels: FloatArray, point_rows: NDArray[np.int64]) -> InlierPoints:
     place = np.full(len(area.maps), -1, dtype=np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     utm = np.empty((len(point_rows), 3))
     for i in order:
         mine = area.point_map[point_rows] == i
         utm[mine] = area.frame.utm_from_enu(area.points[point_rows[mine]], area.maps[i].epsg)
-    return Inliers(pixels=pixels, points_utm=utm, map_rows=place[area.point_map[point_rows]])
+    return InlierPoints(
+        pixels=tuple(map(tuple, np.round(pixels, 2).tolist())),
+        utm=tuple(map(tuple, np.round(utm, 4).tolist())),
+        map_rows=tuple(place[area.point_map[point_rows]].tolist()),
+    )
 
 
 def shape_covariance(

@@ -39,11 +39,6 @@ class PoseHypothesis:
     def count(self) -> int:
         return int(self.inliers.sum())
 
-    @property
-    def focal_is_free(self) -> bool:
-        """Whether the focal length was looked for together with the pose."""
-        return self.camera_source in ("exif", "estimated")
-
 
 def estimate_pose(
     pixels: FloatArray, points: FloatArray, camera: Camera, source: CameraSource, options: PoseOptions

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import GeoPose, geopose_from_camera
@@ -17,7 +16,15 @@ from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.unplaced_map import OwnFrame
 from reloc.localise.lens_prior import QueryLensPrior
-from reloc.wire.query import CameraSource, InMapPose, Lineage, OwnPositionUse, Reason, RunnerUpPose
+from reloc.wire.query import (
+    CameraSource,
+    InlierPoints,
+    InMapPose,
+    Lineage,
+    OwnPositionUse,
+    Reason,
+    RunnerUpPose,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,21 +62,6 @@ class LocaliseRequest:
     beyond: GeoPrior | None = None
     map_ids: tuple[str, ...] | None = None
     want_inliers: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Inliers:
-    """The matches that agree with the pose.
-
-    Attributes:
-        pixels: (k, 2) float64, keypoints of the query in full-size pixels.
-        points_utm: (k, 3) float64, easting, northing, height of the map points.
-        map_rows: (k,) int32, index into LocalisedPose.map_ids.
-    """
-
-    pixels: FloatArray
-    points_utm: FloatArray
-    map_rows: NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,7 +139,7 @@ class LocalisedPose(OnEarth):
     map_ids: tuple[str, ...]
     lineage: tuple[Lineage, ...]
     residual_rms_px: float
-    inliers: Inliers | None = None
+    inliers: InlierPoints | None = None
     view_covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:

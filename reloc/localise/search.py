@@ -273,7 +273,8 @@ def _is_hopeless(matches: int, pose: PoseHypothesis, options: LocaliseOptions) -
 
 
 def _log_nfa(matches: int, inliers: int, pose: PoseHypothesis, options: LocaliseOptions) -> float:
-    camera, sample = pose.camera, 4 if pose.focal_is_free else 3
+    camera = pose.camera
+    sample = 4 if pose.camera_source in ("exif", "estimated") else 3  # a free focal length takes one more
     return log_nfa(matches, inliers, options.pose.tolerance_px(camera), camera.width, camera.height, sample)
 
 

@@ -137,18 +137,13 @@ class LensProblem:
 
 
 def _step(pose: Rigid3, camera: Camera, delta: FloatArray) -> tuple[Rigid3, Camera]:
-    return pose_step(pose, delta[:6]), lens_step(camera, delta[6:])
+    lens = lens_of(camera)
+    moved = lens + delta[6:]
+    moved[0] = np.clip(moved[0], 0.7 * lens[0], 1.4 * lens[0])  # one step's reach
+    return pose_step(pose, delta[:6]), with_lens(camera, moved)
 
 
 def pose_step(pose: Rigid3, delta: FloatArray) -> Rigid3:
     """A pose moved by a rotation and a displacement (6,) of its centre about the local axes."""
     rotation = pose.rotation @ so3_exp(delta[:3]).T
     return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + delta[3:]))
-
-
-def lens_step(camera: Camera, delta: FloatArray) -> Camera:
-    """A lens with other parameters, in the order of `lens_of`."""
-    lens = lens_of(camera)
-    moved = lens + delta
-    moved[0] = np.clip(moved[0], 0.7 * lens[0], 1.4 * lens[0])  # one step's reach
-    return with_lens(camera, moved)

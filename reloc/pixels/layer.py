@@ -41,10 +41,6 @@ class Shape:
     points: FloatArray
     name: str
 
-    @property
-    def is_point(self) -> bool:
-        return len(self.points) == 1
-
 
 def read_layer(path: Path) -> list[Shape]:
     """Points, lines and the rings of polygons of a GeoJSON file.
@@ -179,7 +175,7 @@ def draw_layer(
     seen = _Visibility(view, cloud)
     for shape in shapes:
         pen = (colours[shape.name], thick, cv2.LINE_AA)
-        if shape.is_point:
+        if len(shape.points) == 1:
             pixels, shown = seen(shape.points)
             for x, y in pixels[shown] * scale:
                 cv2.circle(picture, _sixteenths(x, y), 16 * 4 * thick, *pen, _SIXTEENTHS)

@@ -255,12 +255,13 @@ class MapSurface:
             return "the map's points around lie on no surface"
         # Between points so far apart the surface may do what it does at them.
         sigma = float(np.hypot(patch.fitted_m, patch.scatter_m))
-        return Met(patch=patch, sigma_m=sigma, spacing_m=spacing, tolerance_m=tolerance, around=_nowhere)
-
-
-def _nowhere(pixels: FloatArray) -> FloatArray:
-    """A map's few points show no edges."""
-    return np.full(len(pixels), np.nan)
+        return Met(
+            patch=patch,
+            sigma_m=sigma,
+            spacing_m=spacing,
+            tolerance_m=tolerance,
+            around=lambda pixels: np.full(len(pixels), np.nan),  # so few points show no edges
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

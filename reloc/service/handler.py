@@ -1,6 +1,8 @@
 """One query from bytes to reply: parse, decode, localise, word the answer. No network here."""
 
 import uuid
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +17,25 @@ from featuredb.errors import (
 from featuredb.features.decode import DEFAULT_LIMITS, DecodeLimits, decode_gray, probe
 from featuredb.features.exif.read import read_exif
 from featuredb.features.stored_image import ImageHeader
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import prior_from_exif
 from featuredb.stage_clock import StageClock
 from reloc.answered_view import camera_of, geo_prior
 from reloc.localise.lens_prior import QueryLensPrior, known_within
-from reloc.localise.result import LocaliseRequest
+from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult, OnEarth
 from reloc.localiser import Localiser
-from reloc.reply import reply_from_result
 from reloc.wire.query import (
+    Accuracy,
     CameraRequest,
+    CameraUsed,
     ErrorCode,
     LocaliseReply,
     LocaliseWireRequest,
+    Position,
+    Quaternion,
     RequestError,
+    UtmPose,
     bad_request,
 )
 
@@ -128,3 +135,67 @@ def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | No
         return known_within(camera, sigmas)
     except InvalidValueError as error:
         raise bad_request(f"camera.sigmas: {error}") from error
+
+
+def reply_from_result(
+    result: LocaliseResult, *, request_id: str, timings_ms: dict[str, float]
+) -> LocaliseReply:
+    """Word a result as the wire does; `timings_ms` replaces the result's own."""
+    fields: dict[str, Any] = {} if result.pose is None else _pose_fields(result.pose)
+    if result.in_map is not None:
+        fields = {"in_map": result.in_map, "maps": (result.in_map.map_id,)}
+    return LocaliseReply(
+        **{name: getattr(result, name) for name in _SAME},
+        exif_prior=result.own_position,
+        timings_ms=timings_ms,
+        request_id=request_id,
+        **fields,
+    )
+
+
+# What a result and its reply call alike.
+_SAME = (
+    "status",
+    "reason",
+    "detail",
+    "confidence",
+    "features",
+    "matches",
+    "inliers",
+    "snapshot",
+    "runner_up",
+)
+
+
+def place_fields(pose: OnEarth) -> dict[str, Any]:
+    """Position, orientation and how surely, as members of a message."""
+    x, y, z, w = pose.geopose.quaternion_xyzw
+    place = dict(zip(("easting", "northing", "height"), _floats(pose.utm), strict=True))
+    return {
+        "position": Position(
+            lat=pose.geopose.latitude_deg, lon=pose.geopose.longitude_deg, h=pose.geopose.height_m
+        ),
+        "quaternion": Quaternion(x=x, y=y, z=z, w=w),
+        "height_datum": pose.height_datum,
+        "utm": UtmPose(epsg=pose.epsg, cam_from_utm_xyzw=_floats(pose.cam_from_utm_xyzw), **place),
+        "covariance": tuple(_floats(row) for row in pose.covariance),
+        "accuracy": Accuracy.model_validate(pose, from_attributes=True),
+    }
+
+
+def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
+    return {
+        **place_fields(pose),
+        "camera": CameraUsed(**asdict(pose.camera), source=pose.camera_source),
+        "view_covariance": None
+        if pose.view_covariance is None
+        else tuple(_floats(row) for row in pose.view_covariance),
+        "residual_rms_px": pose.residual_rms_px,
+        "maps": pose.map_ids,
+        "lineage": pose.lineage,
+        "inlier_points": pose.inliers,
+    }
+
+
+def _floats(values: FloatArray) -> Any:
+    return tuple(values.tolist())

@@ -93,8 +93,6 @@ class ServeOptions:
             raise InvalidValueError(
                 f"ServeOptions.metrics_port: expected 0..65535, found {self.metrics_port}"
             )
-        if not self.listen and self.config_path is None:
-            raise InvalidValueError("ServeOptions: expected endpoints to listen on, or a Zenoh configuration")
         if self.name:
             check_wire_name(self.name)
 

@@ -5,17 +5,15 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable
 from typing import Literal
 
 import zenoh
 
 from reloc.service.logs import Tally, fields
+from reloc.service.session import JSON
 from reloc.wire.query import ErrorCode, ErrorReply, LocaliseReply, RequestError, encode
 
 logger = logging.getLogger(__name__)
-
-_JSON = zenoh.Encoding.APPLICATION_JSON
 
 
 def session_of(query: zenoh.Query) -> str:
@@ -37,7 +35,6 @@ class PendingQuery:
         key: str,
         deadline_s: float,
         tally: Tally,
-        on_late: Callable[["PendingQuery"], None],  # told the moment that its time is over, in a thread
         *,
         identity: str | None,  # name of the client, where the server authenticates its clients
     ) -> None:
@@ -45,7 +42,7 @@ class PendingQuery:
         self.asker = identity or session_of(query)  # who shares the server with others
         self._query = query
         self._key = key
-        self._tally, self._on_late = tally, on_late
+        self._tally = tally
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
         self.answered = False  # or refused
@@ -55,22 +52,30 @@ class PendingQuery:
         self.size = 0 if query.payload is None else len(query.payload)
 
     def watch(self) -> None:
-        """Say when the deadline is over, also while a worker has the query; again when it is earlier.
+        """Refuse the query when its deadline is over, also while a worker has it.
 
         Raises RequestError: BUSY, the machine has no thread left for that.
         """
         with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
-            if not self.answered:
-                left_s = max(0.0, self.deadline - time.perf_counter())
-                self._timer = threading.Timer(left_s, self._on_late, (self,))
-                self._timer.daemon = True
-                try:
-                    self._timer.start()
-                except RuntimeError as error:
-                    self._timer = None
-                    raise RequestError(ErrorCode.BUSY, "no thread is free; try again in a second") from error
+            if self.answered:
+                return
+            left_s = max(0.0, self.deadline - time.perf_counter())
+            self._timer = threading.Timer(left_s, lambda: self.refuse(self.deadline_error()))
+            self._timer.daemon = True
+            try:
+                self._timer.start()
+            except RuntimeError as error:
+                self._timer = None
+                raise RequestError(ErrorCode.BUSY, "no thread is free; try again in a second") from error
+
+    def deadline_error(self) -> RequestError:
+        """DEADLINE, with how long the query had."""
+        allowed_ms = (self.deadline - self.received) * 1e3
+        return RequestError(
+            ErrorCode.DEADLINE,
+            f"no answer within {allowed_ms:.0f} ms; the server is loaded or the image too large: "
+            "ask again, send a smaller picture or allow more time",
+        )
 
     def bytes_of(self, part: Literal["attachment", "payload"]) -> bytes:
         """A part of the request; empty where there is none or it was answered meanwhile."""
@@ -117,9 +122,9 @@ class PendingQuery:
             try:
                 with self._query as query:
                     if kind == "error":
-                        query.reply_err(payload, encoding=_JSON)
+                        query.reply_err(payload, encoding=JSON)
                     else:
-                        query.reply(self._key, payload, encoding=_JSON, express=True)
+                        query.reply(self._key, payload, encoding=JSON, express=True)
             except zenoh.ZError:  # the client went away, or asked with a selector that takes no such key
                 told = fields("reply_failed", request_id=self.request_id)
                 logger.warning("reply could not be sent", exc_info=True, extra=told)
@@ -227,13 +232,3 @@ class QueryQueue:
             self._waiting[item.asker].remove(item)
             if not self._waiting[item.asker]:
                 del self._waiting[item.asker]
-
-
-def deadline_error(item: PendingQuery) -> RequestError:
-    """DEADLINE, with how long the query had."""
-    allowed_ms = (item.deadline - item.received) * 1e3
-    return RequestError(
-        ErrorCode.DEADLINE,
-        f"no answer within {allowed_ms:.0f} ms; the server is loaded or the image too large: "
-        "ask again, send a smaller picture or allow more time",
-    )

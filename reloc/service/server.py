@@ -19,13 +19,15 @@ from reloc.service.live.session import Follower
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
-from reloc.service.queueing import PendingQuery, QueryQueue, deadline_error
+from reloc.service.queueing import PendingQuery, QueryQueue
 from reloc.service.session import (
+    JSON,
     ServiceStartError,
     authenticates,
     bind_free_port,
     check_exposure,
     open_server_session,
+    publish,
     server_config,
 )
 from reloc.service.source import DatabaseSource, ServedArea
@@ -47,7 +49,6 @@ from reloc.wire.server import (
 
 logger = logging.getLogger(__name__)
 
-_JSON = zenoh.Encoding.APPLICATION_JSON
 _MAX_RETRY_S = 60.0  # a broken snapshot is tried again, ever less often up to this
 
 
@@ -121,16 +122,8 @@ class Server:
         if endpoints:
             config.insert_json5("listen/endpoints", json.dumps(endpoints))
         session = open_server_session(config, ", ".join(endpoints) or str(options.config_path))
-        server = cls(
-            source=source,
-            options=options,
-            database=database,
-            inbox=inbox,
-            area=area,
-            session=session,
-            endpoints=endpoints,
-            authenticates=authenticates(config),
-        )
+        proven = authenticates(config)
+        server = cls(source, options, database, inbox, area, session, endpoints, authenticates=proven)
         try:
             server._declare()
         except zenoh.ZError as error:
@@ -251,7 +244,6 @@ class Server:
             self._keys.localise(client, self.server_id if is_addressed(str(query.key_expr)) else ""),
             self._options.deadline_s,
             self._tally,
-            self._late,
             identity=client if self._authenticates else None,
         )
         try:
@@ -268,17 +260,11 @@ class Server:
 
     def _say(self, leaf: str, message: Callable[[], BaseModel], query: zenoh.Query) -> None:
         with query:
-            query.reply(self._keys.of(leaf), encode(message()), encoding=_JSON)
+            query.reply(self._keys.of(leaf), encode(message()), encoding=JSON)
 
     def _maps(self) -> MapsReply:
         area = self._area
         return MapsReply(database=self.database, snapshot=area.snapshot, maps=area.maps)
-
-    # The deadline of a query calls this.
-
-    def _late(self, item: PendingQuery) -> None:
-        item.refuse(deadline_error(item))
-        self._workers.abandon(item)
 
     def _watch(self) -> None:
         """Poll the source; a load that fails leaves everything as it is and is tried again."""
@@ -339,17 +325,7 @@ class Server:
             detail=detail,
             time=datetime.now(UTC).isoformat(),
         )
-        try:
-            self._session.put(
-                self._keys.of("events"),
-                encode(event),
-                encoding=_JSON,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-        except zenoh.ZError:  # nobody's answer hangs on it
-            logger.warning(
-                "event could not be published", exc_info=True, extra={"fields": event.model_dump()}
-            )
+        publish(self._session, self._keys.of("events"), event, zenoh.CongestionControl.BLOCK)
 
     def _log(self, event: str, **values: object) -> None:
         logger.info("%s %s", self.database, event, extra=fields(event, database=self.database, **values))

@@ -1,15 +1,23 @@
 """Zenoh sessions of the service."""
 
 import json
+import logging
 import re
 import socket
 from pathlib import Path
 from typing import Any
 
 import zenoh
+from pydantic import BaseModel
 
 from featuredb.errors import FeatureDbError
+from reloc.service.logs import fields
 from reloc.wire.keys import DEFAULT_ENDPOINT, is_loopback
+from reloc.wire.query import encode
+
+logger = logging.getLogger(__name__)
+
+JSON = zenoh.Encoding.APPLICATION_JSON
 
 _THIS_MACHINE = ("unixsock-stream", "unixpipe")
 
@@ -63,23 +71,31 @@ def open_server_session(config: zenoh.Config, where: str) -> zenoh.Session:
         raise ServiceStartError(f"cannot listen on {where}: {_first_sentence(error)}; {hint}") from error
 
 
+def publish(
+    session: zenoh.Session, key: str, message: BaseModel, congestion: zenoh.CongestionControl
+) -> None:
+    """Publish a message; one that cannot be is logged, since nobody's answer hangs on it."""
+    try:
+        session.put(key, encode(message), encoding=JSON, congestion_control=congestion, express=True)
+    except zenoh.ZError:
+        logger.warning("not published", exc_info=True, extra=fields("publish_failed", key=key))
+
+
 def bind_free_port(endpoint: str) -> str:
     """`endpoint` with port 0 replaced by a free one, so that the server can say where it is."""
-    match = re.fullmatch(r"(tcp|tls|quic)/(.+):0(\?.*|#.*)?", endpoint)
+    match = re.fullmatch(r"((?:tcp|tls)/(.+)):0", endpoint)
     if match is None:
         return endpoint
     host = match[2].strip("[]")
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    kind = socket.SOCK_DGRAM if match[1] == "quic" else socket.SOCK_STREAM
     try:
-        with socket.socket(family, kind) as probe:
-            probe.bind((host, 0))
-            port = int(probe.getsockname()[1])
+        with socket.create_server(
+            (host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        ) as probe:
+            return f"{match[1]}:{probe.getsockname()[1]}"
     except OSError as error:
         raise ServiceStartError(
             f"cannot listen on {endpoint}: {error}; expected endpoints like {DEFAULT_ENDPOINT}"
         ) from error
-    return f"{match[1]}/{match[2]}:{port}{match[3] or ''}"
 
 
 def _first_sentence(error: Exception) -> str:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 
-from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
 from reloc.localise.options import LocaliseOptions
 
@@ -65,10 +64,3 @@ class TrackOptions:
         default_factory=lambda: ExtractorOptions(first_octave_px=2000, max_features=6000, oversample=1.0)
     )
     localise: LocaliseOptions = field(default_factory=LocaliseOptions)  # how a lost track is found again
-
-    def __post_init__(self) -> None:
-        if self.catch_up < 2:
-            raise InvalidValueError(
-                f"TrackOptions.catch_up: expected 2 frames or more, found {self.catch_up}: a track that was "
-                "found would never come to the frame at hand"
-            )

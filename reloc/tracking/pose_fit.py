@@ -79,7 +79,7 @@ def fit_pose(
 
     def linearise() -> None:
         longer = focal * float(np.exp(zoom))
-        rotation = np.ascontiguousarray(pose.rotation)  # the loop is compiled for this order alone
+        rotation = np.array(pose.rotation, order="C")  # the loop is compiled for this order, and once
         made = (residual, jacobian, normal, gradient)
         linearised(rotation, pose.translation, points, seen, focal, longer, loss, *made)
 

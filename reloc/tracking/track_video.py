@@ -1,13 +1,11 @@
 """A whole video: frames in, a trajectory out, and a film with the track drawn over it on request."""
 
-import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
 
 import cv2
 import numpy as np
@@ -81,54 +79,27 @@ def _words(point: TrajectoryPoint) -> list[str]:
     ]
 
 
-class ReadAhead:
+def read_ahead(
+    video: Video, idle: Callable[[], bool] = lambda: True, most: int = 24
+) -> Generator[VideoFrame, None, None]:
     """The frames of an open film, in order; what goes wrong as they are read is raised at its frame.
 
-    A context manager, to be left before the film is closed; to be used from one thread. The film's `report`
-    knows of frames that were read ahead. Live sources are not: what they show now is wanted.
+    While it is `idle` after a frame, a thread decodes further ones: up to `most`, fewer where they are large.
+    The film's `report` knows of them. Live sources are not read ahead: what they show now is wanted.
     """
-
-    def __init__(self, video: Video, most: int = 24) -> None:
-        """`most`: frames that are decoded before they are used, 0 for none; fewer where they are large."""
-        info = video.info
-        bytes_each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
-        self._frames: Iterator[VideoFrame] | None = None
-        self._video = video
-        self._most = 0 if info.live else min(most, max(1, _MOST_BYTES // bytes_each))
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="decoding")
-        self._ahead: deque[Future[VideoFrame | None]] = deque()
-        self.seconds = 0.0  # that decoding has taken, ahead or not
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *failed: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-    def read_on(self, frames: int) -> None:
-        """Decode so many more frames in the background, up to `most` not yet used; none before the first."""
-        if self._frames is None:
-            return
-        for _ in range(min(frames, self._most - len(self._ahead))):
-            self._ahead.append(self._pool.submit(self._next))
-
-    def __iter__(self) -> Iterator[VideoFrame]:
-        """The film's frames; once, and with the errors of `Video.__iter__`."""
-        self._frames = iter(self._video)
-        while True:
-            # Nothing is decoded elsewhere where nothing is waited for: frames stay in order.
-            frame = self._ahead.popleft().result() if self._ahead else self._next()
-            if frame is None:
-                return
-            yield frame
-
-    def _next(self) -> VideoFrame | None:
-        assert self._frames is not None
-        began = time.perf_counter()
+    info, frames = video.info, iter(video)
+    bytes_each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
+    most = 0 if info.live else min(most, max(1, _MOST_BYTES // bytes_each))
+    ahead: deque[Future[VideoFrame | None]] = deque()
+    with ThreadPoolExecutor(1, thread_name_prefix="decoding") as pool:
         try:
-            return next(self._frames, None)
+            # Nothing is decoded here while anything is there: frames stay in order.
+            while (frame := ahead.popleft().result() if ahead else next(frames, None)) is not None:
+                yield frame
+                wanted = min(_READ_ON, most - len(ahead)) if idle() else 0
+                ahead.extend(pool.submit(next, frames, None) for _ in range(wanted))
         finally:
-            self.seconds += time.perf_counter() - began
+            pool.shutdown(cancel_futures=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,9 +124,7 @@ class TrackedVideo:
 
     trajectory: Trajectory
     camera: Camera | None  # of the frames as they were tracked; None where nothing was localised
-    # `total`; of it `tracking` and `drawing`, the rest is waiting for frames; `decoding`, also beside the
-    # tracking; `longest_gap` between the poses of two frames.
-    seconds: dict[str, float]
+    seconds: dict[str, float]  # `total`; of it `tracking`, `drawing` and `waiting` for frames
     complaints: tuple[str, ...]  # what was wrong with the film, for people
 
 
@@ -182,7 +151,6 @@ def track_video(
     points: list[TrajectoryPoint] = []
     trouble: list[str] = []
     clock = StageClock()
-    last = gap = 0.0
     threads = cv2.getNumThreads()
     # Flow of a few hundred points gains nothing by a second thread; the keyframes have that core.
     cv2.setNumThreads(1)
@@ -205,25 +173,20 @@ def track_video(
                     )
                 )
             first_s: float | None = None
-            ahead = stack.enter_context(ReadAhead(video))
+            frames = stack.enter_context(closing(read_ahead(video, lambda: not tracker.busy)))
             clock.lap("tracking")
-            for frame in until_it_ends(ahead, trouble):
+            for frame in until_it_ends(frames, trouble):
                 clock.lap("waiting")
                 tracked = tracker.track(frame.gray, frame.time_s, frame.camera_key)
                 point = point_of(tracked)
                 points.append(point)
                 _filled(points, tracker.late)
-                now = time.perf_counter()
-                gap, last = (max(gap, now - last) if len(points) > 1 else 0.0), now
                 clock.lap("tracking")
                 if writer is not None:
                     first_s = frame.time_s if first_s is None else first_s
                     picture = draw_frame(frame.rgb(), tracked, point)
                     writer.write(picture[: writer.height, : writer.width], frame.time_s - first_s)
                     clock.lap("drawing")
-                if not tracker.busy:
-                    ahead.read_on(_READ_ON)
-                clock.lap("tracking")
             if not points:
                 raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
             _filled(points, tracker.finish())
@@ -238,10 +201,9 @@ def track_video(
         camera=lens,
         seconds={
             "total": sum(seconds.values()),
-            "decoding": ahead.seconds,
+            "waiting": seconds.get("waiting", 0.0),
             "tracking": seconds["tracking"],
             "drawing": seconds.get("drawing", 0.0),
-            "longest_gap": gap,
         },
         complaints=complaints,
     )

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Self
@@ -20,9 +20,6 @@ from reloc.wire.track import TrackState
 
 Answer = Keyframe | Unmatched
 _FAR = sys.maxsize
-# What would be waited for in one go when it is due is waited for a little at each frame: for a search, and a
-# keyframe of many features, from the first; for another keyframe at the last ones, which it seldom needs.
-_PACE_S, _LAST_PACE_S, _LAST_FRAMES = 0.05, 0.02, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,9 +28,8 @@ class _Sent:
 
     index: int
     answer: "Future[Answer]"
-    due: int = _FAR
-    due_s: float = float("inf")
-    slow: bool = False  # it takes longer than the frames until then
+    due: int
+    due_s: float
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -200,10 +196,7 @@ class Tracker:
         if sent is None:
             return None
         due = now.index >= sent.due or now.time_s >= sent.due_s
-        ready = sent.answer.done() if self._options.live else due
-        if not ready:
-            if not self._options.live and (sent.slow or now.index >= sent.due - _LAST_FRAMES):
-                wait([sent.answer], timeout=_PACE_S if sent.slow else _LAST_PACE_S)
+        if not (sent.answer.done() if self._options.live else due):
             return None
         self._sent = None
         return sent
@@ -280,7 +273,7 @@ class Tracker:
         options = self._options
         answer = self._pool.submit(self._finder.find, now.gray.copy(), self._request_of(now), options)
         due, due_s = now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s
-        self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s, slow=True)
+        self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s)
 
     def _send_keyframe(self, now: RecentFrame, fitted: FittedPose, track: FlowTrack) -> None:
         """Have this frame matched against the ground, if it is time for a keyframe and the thread is free."""
@@ -298,7 +291,7 @@ class Tracker:
             track.ground.match, now.gray.copy(), track.camera, fitted.cam_from_local, options
         )
         due, due_s = now.index + options.answer_after, now.time_s + options.answer_after_s
-        self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s, slow=few)
+        self._sent = _Sent(index=now.index, answer=answer, due=due, due_s=due_s)
         self._next_keyframe = now.index + options.keyframe_every
         self._next_keyframe_s = now.time_s + options.keyframe_every_s
 

@@ -8,15 +8,13 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 
 from featuredb.export.job import whole_or_nothing
 from reloc.viewer.photos import THUMBNAIL_PX, Pictures, data_url
 from reloc.viewer.scene import ViewerScene
 
-_MEDIA_TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "json": "application/json"}
-_TEMPLATE = "index.html"
+ASSETS = Path(__file__).with_name("assets")
 _STYLE = "viewer.css"
 # Module names of the libraries; "three/core" is what three.module.min.js calls "./three.core.min.js".
 _LIBRARIES = {
@@ -25,27 +23,6 @@ _LIBRARIES = {
     "three/orbit": "vendor/OrbitControls.js",
 }
 _RELATIVE_CORE = b'"./three.core.min.js"'
-
-
-def assets() -> dict[str, bytes]:
-    """All files that the page loads, by their path below /assets/."""
-    return assets_of("reloc.viewer", "", "js", "vendor")
-
-
-def media_type_of(file: str) -> str:
-    """What an asset of this name is sent as."""
-    return _MEDIA_TYPES[file.rsplit(".", 1)[-1]]
-
-
-def assets_of(package: str, *folders: str) -> dict[str, bytes]:
-    """All files but the page in folders of a package's `assets`, by their path there."""
-    root = resources.files(package) / "assets"
-    found = {}
-    for folder in folders:
-        for file in (root / folder).iterdir():
-            if file.is_file() and file.name != _TEMPLATE:
-                found[f"{folder}/{file.name}" if folder else file.name] = file.read_bytes()
-    return found
 
 
 def page() -> str:
@@ -72,19 +49,17 @@ def content_policy() -> str:
 
 def page_in_one(values: Mapping[str, str]) -> str:
     """The page with everything in it; `values`: texts by id that it finds in itself, JSON or base64."""
-    files = assets()
+    modules = {name: (ASSETS / path).read_bytes() for name, path in _LIBRARIES.items()}
     # A module in a data URL has no folder to look into, so the library's one relative import gets a name.
-    three = files[_LIBRARIES["three"]]
-    assert _RELATIVE_CORE in three
-    modules = {name: files[path] for name, path in _LIBRARIES.items()}
-    modules["three"] = three.replace(_RELATIVE_CORE, b'"three/core"')
-    modules |= {f"viewer/{n.removeprefix('js/')}": data for n, data in files.items() if n.startswith("js/")}
+    assert _RELATIVE_CORE in modules["three"]
+    modules["three"] = modules["three"].replace(_RELATIVE_CORE, b'"three/core"')
+    modules |= {f"viewer/{file.name}": file.read_bytes() for file in sorted((ASSETS / "js").iterdir())}
     imports = {
         name: f"data:text/javascript;base64,{base64.b64encode(data).decode()}"
         for name, data in modules.items()
     }
-    style = f"<style>\n{files[_STYLE].decode()}</style>"
-    licence = files["vendor/LICENSE-three.txt"].decode()
+    style = f"<style>\n{(ASSETS / _STYLE).read_text(encoding='utf-8')}</style>"
+    licence = (ASSETS / "vendor" / "LICENSE-three.txt").read_text(encoding="utf-8")
     inside = "".join(
         f'<script type="text/plain" id="{name}">{text.replace("<", chr(92) + "u003c")}</script>\n'
         for name, text in values.items()
@@ -98,7 +73,7 @@ def page_in_one(values: Mapping[str, str]) -> str:
 
 
 def _filled(*, imports: Mapping[str, str], style: str, values: str, main: str) -> str:
-    template = (resources.files("reloc.viewer") / "assets" / _TEMPLATE).read_text(encoding="utf-8")
+    template = (ASSETS / "index.html").read_text(encoding="utf-8")
     # The values last: whatever maps are called, nothing is looked for in them.
     marks = {"@STYLE@": style, "@IMPORTS@": json.dumps({"imports": imports}), "@MAIN@": main}
     for mark, text in {**marks, "@VALUES@": values}.items():

@@ -8,40 +8,33 @@ media type that a browser does not send to another site unasked.
 import asyncio
 import sys
 import webbrowser
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI, Request, Response
-from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
+from starlette.staticfiles import StaticFiles
 
 from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
-from reloc.listening import listen, run, uvicorn_server
-from reloc.viewer.page import assets, content_policy, media_type_of, page
+from reloc.listening import CLIENT_GONE, listen, run, uvicorn_server
+from reloc.viewer.page import ASSETS, content_policy, page
 from reloc.viewer.photos import LIMITS, PICTURE_PX, Pictures, Queries
 from reloc.viewer.scene import ViewerScene
-from reloc.wire.query import ErrorCode
 
 HOST = "127.0.0.1"
 PHOTO_TYPE = "application/octet-stream"
-_STATUS = {
-    ErrorCode.BAD_REQUEST.value: 400,
-    ErrorCode.BAD_IMAGE.value: 415,
-    ErrorCode.TOO_LARGE.value: 413,
-    ErrorCode.INCOMPATIBLE_EXTRACTOR.value: 409,
-}
-_CLIENT_GONE = 499
 
 
 def create_app(scene: ViewerScene, pictures: Pictures, queries: Queries) -> FastAPI:
     """The application; `queries` answers photos that are dropped on the page."""
     # Pictures and queries are decoded beside the event loop; a query takes its own turn inside.
-    app, in_thread = local_app("featuredb viewer", page(), content_policy(), assets())
+    app, in_thread = local_app("featuredb viewer", page(), content_policy(), ASSETS)
     document = {**scene.document, "queries": True}
 
     @app.get("/api/scene")
@@ -78,11 +71,12 @@ def create_app(scene: ViewerScene, pictures: Pictures, queries: Queries) -> Fast
 
 
 def local_app(
-    title: str, html: str, policy: str, files: Mapping[str, bytes], prefix: str = ""
+    title: str, html: str, policy: str, assets: Path, prefix: str = ""
 ) -> tuple[FastAPI, Callable[[Callable[[], Any]], Awaitable[Any]]]:
     """An application for this machine, and what runs a function beside its event loop.
 
-    The page is at `prefix`/, with `policy` as its Content-Security-Policy, files lie below `prefix`/assets/.
+    The page is at `prefix`/, with `policy` as its Content-Security-Policy, files of the folder `assets` lie
+    below `prefix`/assets/.
     """
     app = FastAPI(title=title, docs_url=None, redoc_url=None, openapi_url=None)
     threads = ThreadPoolExecutor(4, thread_name_prefix=title)
@@ -95,12 +89,7 @@ def local_app(
     async def index() -> Response:
         return Response(html, media_type="text/html", headers=headers)
 
-    @app.get(f"{prefix}/assets/{{name:path}}")
-    async def asset(name: str) -> Response:
-        if name not in files:
-            raise HTTPException(404, f"no file {name[:100]!r}")
-        return Response(files[name], media_type=media_type_of(name))
-
+    app.mount(f"{prefix}/assets", StaticFiles(directory=assets))
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
     return app, in_thread
 
@@ -152,30 +141,14 @@ def _where(scene: ViewerScene, place: int, east: float, north: float, up: float)
 
 
 def _add_failures(app: FastAPI) -> None:
-    """Every way to fail ends in {"code", "message"}."""
-
-    def failed(status: int, code: str, message: str) -> Response:
-        return JSONResponse({"code": code, "message": message}, status)
+    """What the page says where something fails is in `message`, or in FastAPI's `detail`."""
 
     @app.exception_handler(FeatureDbError)
     async def failure(request: Request, error: FeatureDbError) -> Response:
-        if isinstance(error, ServiceError):
-            return failed(_STATUS.get(error.code, 500), error.code, error.message)
-        if isinstance(error, InvalidValueError | GeodesyError):
-            return failed(400, ErrorCode.BAD_REQUEST.value, str(error))
-        return failed(500, ErrorCode.INTERNAL.value, str(error))  # the database is gone, for example
-
-    @app.exception_handler(RequestValidationError)
-    async def unreadable(request: Request, error: RequestValidationError) -> Response:
-        return failed(400, ErrorCode.BAD_REQUEST.value, "the request cannot be read")
-
-    @app.exception_handler(HTTPException)
-    async def http_error(request: Request, error: HTTPException) -> Response:
-        code = {404: "NOT_FOUND", 405: "METHOD_NOT_ALLOWED", 413: ErrorCode.TOO_LARGE.value}
-        return failed(
-            error.status_code, code.get(error.status_code, ErrorCode.BAD_REQUEST.value), error.detail
-        )
+        asked_wrong = isinstance(error, ServiceError | InvalidValueError | GeodesyError)
+        # Otherwise the database is gone, for example.
+        return JSONResponse({"message": str(error)}, 400 if asked_wrong else 500)
 
     @app.exception_handler(ClientDisconnect)
     async def gone(request: Request, error: ClientDisconnect) -> Response:
-        return Response(status_code=_CLIENT_GONE)
+        return Response(status_code=CLIENT_GONE)

@@ -17,7 +17,6 @@ WIRE_VERSION = "2"  # 2: keys name the client
 MAX_ATTACHMENT_BYTES = 65_536  # a request needs a few hundred; more is a mistake or an attack
 # A message larger than so many largest payloads is not even gathered; up to it the client hears TOO_LARGE.
 MESSAGE_HEADROOM = 4
-_SHOWN_INPUT_CHARS = 80  # of a refused value, in the message that refuses it
 
 
 # Words of an answer: why there is no pose, where the lens came from, what the photo's own position did.
@@ -280,7 +279,19 @@ class ContributionReply(Answer):
     detail: str
 
 
-class LocaliseReply(Answer):
+class PlacedAnswer(Answer):
+    """Where a camera was on Earth, and how surely; all null where that is not known."""
+
+    position: Position | None = None
+    quaternion: Quaternion | None = None
+    body_axes: Literal["x forward, y left, z up"] = "x forward, y left, z up"
+    height_datum: str | None = None
+    utm: UtmPose | None = None
+    covariance: Covariance6 | None = None
+    accuracy: Accuracy | None = None
+
+
+class LocaliseReply(PlacedAnswer):
     """The answer to a localise query; the pose's fields are null when it is not localised on Earth.
 
     `view_covariance`: of the six of `covariance` and then of `camera.params`, for what pixels show; null
@@ -293,23 +304,16 @@ class LocaliseReply(Answer):
     status: Literal["localised", "localised_in_map", "not_localised"]
     reason: Reason | None
     detail: str
-    position: Position | None
-    quaternion: Quaternion | None
-    body_axes: Literal["x forward, y left, z up"]
-    height_datum: str | None
-    utm: UtmPose | None
-    covariance: Covariance6 | None
-    accuracy: Accuracy | None
     confidence: Unit
-    camera: CameraUsed | None
+    camera: CameraUsed | None = None
     features: Count
     matches: Count
     inliers: Count
-    residual_rms_px: NotNegative | None
-    maps: tuple[str, ...]
-    lineage: tuple[Lineage, ...]
-    runner_up: RunnerUpPose | None
-    inlier_points: InlierPoints | None
+    residual_rms_px: NotNegative | None = None
+    maps: tuple[str, ...] = ()
+    lineage: tuple[Lineage, ...] = ()
+    runner_up: RunnerUpPose | None = None
+    inlier_points: InlierPoints | None = None
     snapshot: Count
     timings_ms: dict[str, NotNegative]
     request_id: str
@@ -319,14 +323,10 @@ class LocaliseReply(Answer):
     exif_prior: OwnPositionUse | None = None
 
     @model_validator(mode="after")
-    def _size_of_view(self) -> "LocaliseReply":
+    def _pose_or_reason(self) -> "LocaliseReply":
         size = 6 + (0 if self.camera is None else len(self.camera.params))
         if self.view_covariance is not None and [len(r) for r in self.view_covariance] != [size] * size:
             raise ValueError(f"view_covariance: expected {size} rows of {size}")
-        return self
-
-    @model_validator(mode="after")
-    def _pose_or_reason(self) -> "LocaliseReply":
         pose = (self.position, self.quaternion, self.utm, self.covariance, self.accuracy, self.camera)
         if self.status == "localised" and (self.reason is not None or any(p is None for p in pose)):
             raise ValueError("a localised reply needs every field of the pose and no reason")
@@ -373,13 +373,8 @@ def explain(error: ValidationError, whole: str = "attachment", *, inputs: bool =
     """One line for people out of pydantic's list: field (or `whole`), expectation, what was found."""
     parts = []
     for item in error.errors(include_url=False, include_input=inputs, include_context=False)[:3]:
-        told = f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}"
-        if inputs:
-            shown = repr(item["input"])
-            if len(shown) > _SHOWN_INPUT_CHARS:
-                shown = shown[:_SHOWN_INPUT_CHARS] + "..."
-            told += f", found {shown}"
-        parts.append(told)
+        shown = f", found {item['input']!r:.80}" if inputs else ""
+        parts.append(f"{'.'.join(map(str, item['loc'])) or whole}: {item['msg']}{shown}")
     return "; ".join(parts)
 
 

@@ -6,18 +6,14 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from reloc.wire.query import (
-    Accuracy,
     Answer,
     CameraRequest,
     Count,
-    Covariance6,
     Intrinsics,
     NotNegative,
-    Position,
+    PlacedAnswer,
     PriorRequest,
-    Quaternion,
     Request,
-    UtmPose,
 )
 
 # JSON's numbers are exact up to here.
@@ -77,7 +73,7 @@ class TrackFrame(Request):
 TrackState = Literal["tracking", "relocalised", "lost"]
 
 
-class TrackPose(Answer):
+class TrackPose(PlacedAnswer):
     """Publication on `.../<session>/poses`: one for each frame that was looked at, in their order.
 
     The pose's fields are those of a localise reply, and null while the track is lost; `detail` then says why.
@@ -90,16 +86,9 @@ class TrackPose(Answer):
     time_s: float
     state: TrackState
     detail: str
-    position: Position | None
-    quaternion: Quaternion | None
-    body_axes: Literal["x forward, y left, z up"]
-    height_datum: str | None
-    utm: UtmPose | None
-    covariance: Covariance6 | None
-    accuracy: Accuracy | None
-    camera: Intrinsics | None
+    camera: Intrinsics | None = None
     inliers: Count
-    map_id: str | None
+    map_id: str | None = None
     snapshot: Count
     dropped: Count
     received_at: str

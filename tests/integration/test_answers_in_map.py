@@ -18,7 +18,7 @@ from featuredb.store import Database
 from reloc.gateway.geopose import GeoPoseReq, NotLocalisedError, response_of
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.reply import reply_from_result
+from reloc.service.handler import reply_from_result
 from reloc.wire.query import LocaliseReply
 from reloc.wording import describe
 from schemas import load_schema

@@ -146,7 +146,6 @@ def test_metrics_count_requests_by_route_and_status_and_show_the_server():
     assert found['featuredb_server_queries_total{code="",outcome="localised"}'] == 3
     assert found['featuredb_server_queries_total{code="BAD_IMAGE",outcome="error"}'] == 1
     assert found["featuredb_server_snapshot"] == 5
-    assert found["featuredb_gateway_sessions_total"] == 1
 
 
 def test_web_pages_may_ask_where_their_origin_is_allowed():
@@ -257,7 +256,7 @@ def test_options_that_make_no_sense_are_refused():
         {"prefix": "/vps/"},
         {"port": 70_000},
         {"timeout_s": 0.0},
-        {"workers": 0},
+        {"max_in_flight": 0},
     ):
         with pytest.raises(InvalidValueError, match=next(iter(wrong))):
             GatewayOptions(**wrong)

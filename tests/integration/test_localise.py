@@ -389,8 +389,8 @@ def test_the_timings_add_up_and_the_inliers_reproject(area: IndexedArea, photo: 
     assert result.pose is not None
     inliers = result.pose.inliers
     assert inliers is not None
-    local = area.area.frame.enu_from_utm(inliers.points_utm, EPSG)
-    gap = np.linalg.norm(CAMERA.project(POSE.act(local)) - inliers.pixels, axis=1)
+    local = area.area.frame.enu_from_utm(np.array(inliers.utm), EPSG)
+    gap = np.linalg.norm(CAMERA.project(POSE.act(local)) - np.array(inliers.pixels), axis=1)
     assert len(gap) == result.inliers
     assert np.median(gap) < 0.5
     assert gap.max() < 3.0

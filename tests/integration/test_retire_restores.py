@@ -12,7 +12,7 @@ from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.store import Database
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.reply import reply_from_result
+from reloc.service.handler import reply_from_result
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
 from tests.support.remembered import remembered
 

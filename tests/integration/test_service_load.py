@@ -16,6 +16,7 @@ from reloc.service.session import ServiceStartError
 from reloc.service.workers import pool as pool_module
 from reloc.service.workers import process
 from reloc.wire.query import ErrorCode, LocaliseReply
+from tests.support.events import watch_events
 from tests.support.service import (
     Gate,
     MemorySource,
@@ -202,7 +203,7 @@ def test_hot_reload_under_load_drops_no_query_and_announces_itself():
     with (
         running_server(source, options) as server,
         client_of(server) as client,
-        client.watch_events() as events,
+        watch_events(client) as events,
         ThreadPoolExecutor(8) as pool,
     ):
         in_flight = pool.submit(client.localise, photo())
@@ -247,7 +248,7 @@ def test_a_reload_that_fails_leaves_the_old_snapshot_in_service_and_says_so():
     with (
         running_server(source, ServeOptions(poll_interval_s=0.05)) as server,
         client_of(server) as client,
-        client.watch_events() as events,
+        watch_events(client) as events,
     ):
         source.failure = StoreError("table points: file missing")
         source.newest = 2
@@ -270,7 +271,7 @@ def test_tiles_of_a_reloaded_area_are_advertised():
     with (
         running_server(source, ServeOptions(poll_interval_s=0.05)) as server,
         client_of(server) as client,
-        client.watch_events() as events,
+        watch_events(client) as events,
     ):
         moved = map_info("map-b").model_copy(update={"tiles": ("32632-E000900_N010604",)})
         source.publish(area_of(ScriptedLocaliser(2), moved))
@@ -291,7 +292,7 @@ def test_shutdown_answers_what_is_in_hand_and_tells_the_rest():
     with (
         running_server(gated(1, gate), options) as server,
         client_of(server) as client,
-        client.watch_events() as events,
+        watch_events(client) as events,
         ThreadPoolExecutor(3) as pool,
     ):
         in_hand = pool.submit(outcome, client)

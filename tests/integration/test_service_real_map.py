@@ -27,6 +27,7 @@ from reloc.service.options import ServeOptions
 from reloc.service.serve import serve
 from reloc.wire.query import LocaliseReply
 from tests.support.contributions import load_image
+from tests.support.events import watch_events
 from tests.support.planar_map import (
     CAMERA,
     EASTING,
@@ -303,7 +304,7 @@ def test_hot_reload_commit_retire_and_a_clean_end(tmp_path, field, photos):
     database = Database.create(tmp_path / "growing")
     process = ServeProcess(tmp_path / "growing", "--name", "growing")
     image = (photos / "a.png").read_bytes()
-    with Client(process.endpoint) as client, client.watch_events() as events:
+    with Client(process.endpoint) as client, watch_events(client) as events:
 
         def wait_for_reload() -> list[str]:
             seen = []

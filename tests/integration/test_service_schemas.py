@@ -18,6 +18,7 @@ from reloc.wire.query import (
 )
 from reloc.wire.server import MapsReply, StatusReply
 from schemas import load_schema
+from tests.support.events import watch_events
 from tests.support.service import (
     MemoryInbox,
     MemorySource,
@@ -87,7 +88,7 @@ def messages():
                 )
             found["status"].append(raw(session, "status"))
             found["maps"].append(raw(session, "maps"))
-            with client.watch_events() as events:
+            with watch_events(client) as events:
                 source.publish(area_of(ScriptedLocaliser(2), map_info("map-b")))
                 while (event := events.next(timeout_s=10)) is not None and event.type != "reloaded":
                     pass

@@ -22,6 +22,7 @@ from featuredb.store.candidates.states import ANONYMOUS
 from reloc.client import NO_SERVER, Client, LiveTrack, TrackPose
 from reloc.wire.query import encode
 from reloc.wire.track import LiveStatus, TrackEvent, TrackFrame
+from tests.support.events import watch_events
 from tests.support.live import LENS, SOON_S, jpeg, wait_until
 from tests.support.service import photo
 from tests.support.strangers import Wire, config_of, free_port, guarded_wire, keys, open_wire, restarted
@@ -194,7 +195,7 @@ def test_nobody_asks_in_another_client_s_name(scene: Scene, leaf: str) -> None:
 
 
 def test_a_client_s_events_are_the_server_s_own(scene: Scene) -> None:
-    with scene.wire.client(_VICTIM) as victim, victim.watch_events() as events:
+    with scene.wire.client(_VICTIM) as victim, watch_events(victim) as events:
         event = {"type": "stopping", "database": "town", "server_id": "x", "snapshot": 1, "map_id": None}
         forged = json.dumps({**event, "detail": "forged", "time": ""}).encode()
 

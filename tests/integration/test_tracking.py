@@ -213,35 +213,6 @@ def test_a_found_track_catches_up_a_few_frames_at_a_time(
         assert not slow.late
 
 
-@pytest.mark.parametrize(
-    ("few", "live", "waits"),
-    [
-        (0.0, False, [0.02] * 4),  # a keyframe: at the last four frames before its answer is due
-        (1.0, False, [0.05] * 9),  # one of many features, as landmarks run out: from the next frame on
-        (0.0, True, []),
-    ],
-)
-def test_an_answer_is_waited_for_a_little_at_each_frame(
-    areas: tuple[IndexedArea, ...],
-    film: list[np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
-    few: float,
-    live: bool,
-    waits: list[float],
-) -> None:
-    """And not in one gap at the frame at which it is due."""
-    options = replace(OPTIONS, keyframe_every=10, answer_after=10, few_landmarks=few, live=live)
-    said: list[float] = []
-    monkeypatch.setattr("reloc.tracking.tracker.wait", lambda _, timeout: said.append(timeout))
-    with Tracker(MapFinder(areas), CAMERA, options) as tracker:
-        for i, gray in enumerate(film[:17]):
-            tracked = tracker.track(gray, i / 30.0)
-            if i == 6:  # found here, which is a keyframe, answered at frame 16
-                assert live or (tracked.state != "lost" and said == [0.05] * 5)
-                said.clear()
-    assert said == waits
-
-
 def test_searches_in_vain_do_not_count_against_the_track_that_is_found(
     areas: tuple[IndexedArea, ...], film: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,12 +22,12 @@ from featuredb.store.candidates.states import Contribution
 from reloc.client import Client
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.options import LocaliseOptions
-from reloc.localise.result import Inliers, LocalisedPose, LocaliseRequest, LocaliseResult
+from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.service.source import ServedArea
-from reloc.wire.query import Lineage, RunnerUpPose
+from reloc.wire.query import InlierPoints, Lineage, RunnerUpPose
 from reloc.wire.server import BoundingBox, MapInfo
 
 EPSG = 32632
@@ -39,10 +39,10 @@ def localised(snapshot: int, camera: Camera, *, want_inliers: bool = False) -> L
     frame = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
     rotation = Rigid3.exp([2.3, 0.2, -0.1, 0, 0, 0]).rotation
     cam_from_local = Rigid3(rotation=rotation, translation=-rotation @ np.array([30.0, -20.0, 50.0]))
-    inliers = Inliers(
-        pixels=np.array([[10.5, 20.25], [100.0, 50.0]]),
-        points_utm=np.array([[EASTING, NORTHING, HEIGHT], [EASTING + 5.5, NORTHING - 3.25, HEIGHT]]),
-        map_rows=np.array([0, 0], dtype=np.int32),
+    inliers = InlierPoints(
+        pixels=((10.5, 20.25), (100.0, 50.0)),
+        utm=((EASTING, NORTHING, HEIGHT), (EASTING + 5.5, NORTHING - 3.25, HEIGHT)),
+        map_rows=(0, 0),
     )
     pose = LocalisedPose(
         frame=frame,

@@ -24,7 +24,7 @@ from featuredb.geometry.arrays import FloatArray
 from reloc.bridge.mavlink import MavlinkSender, UdpLink
 from reloc.bridge.nmea import sentences
 from reloc.bridge.robot_pose import RobotPose, read_answers
-from reloc.bridge.ros2 import McapLog, messages
+from reloc.bridge.ros2 import mcap_log, messages
 from tests.support.command_line import only_command
 
 ORIGIN = LocalFrame(latitude_deg=-33.86, longitude_deg=151.2, height_m=20.0)
@@ -197,7 +197,7 @@ def test_a_recording_is_not_written_over(tmp_path: Path) -> None:
     there = tmp_path / "run.mcap"
     there.write_bytes(b"an earlier flight")
     for path in (there, tmp_path / "no/run.mcap"):
-        with pytest.raises(InvalidValueError, match="expected a new file"), McapLog(path):
+        with pytest.raises(InvalidValueError, match="expected a new file"), mcap_log(path):
             pass
     assert there.read_bytes() == b"an earlier flight"
 
@@ -222,7 +222,11 @@ def test_a_camera_that_looks_down_is_on_a_level_vehicle() -> None:
     ahead, up = np.array([np.sin(heading), np.cos(heading), 0.0]), np.array([0.0, 0.0, 1.0])
     looks_down = Rotation.from_matrix(np.column_stack([-up, np.cross(up, ahead), ahead]))
     down = pose(turn=looks_down, mount="down")
-    found = decoded(MavlinkSender(("vision",)).pack(down, down.frame_here())[0])
+    found = decoded(
+        MavlinkSender(("vision",)).pack(
+            down, LocalFrame(latitude_deg=down.lat, longitude_deg=down.lon, height_m=down.height_m)
+        )[0]
+    )
     np.testing.assert_allclose([found.roll, found.pitch, found.yaw], [0.0, 0.0, heading], atol=1e-5)
 
 
@@ -255,9 +259,9 @@ def test_ros_messages_are_read_by_two_libraries(tmp_path: Path) -> None:
     )
 
     path = tmp_path / "run.mcap"
-    with McapLog(path) as log:
-        log.write(pose(), ORIGIN)
-        log.write(pose("unknown"), ORIGIN)
+    with mcap_log(path) as write:
+        write(pose(), ORIGIN)
+        write(pose("unknown"), ORIGIN)
     read = {}
     with path.open("rb") as file:
         for _, channel, _, told in make_reader(

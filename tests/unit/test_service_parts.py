@@ -1,23 +1,19 @@
 """Parts of the service that need no network."""
 
-import threading
 import time
 from typing import get_args
 
-import cv2
 import pytest
-from threadpoolctl import threadpool_info
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
-from reloc.reply import reply_from_result
+from reloc.service.handler import reply_from_result
 from reloc.service.logs import Tally
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
 from reloc.service.queueing import QueryQueue
 from reloc.service.session import bind_free_port
-from reloc.service.workers.answering import capped_process
 from reloc.wire.keys import Keys
 from reloc.wire.query import (
     ContributionReply,
@@ -68,11 +64,6 @@ def test_a_page_of_figures_needs_a_port(port):
         ServeOptions(metrics_port=port)
 
 
-def test_a_server_must_listen_somewhere():
-    with pytest.raises(InvalidValueError, match="listen"):
-        ServeOptions(listen=())
-
-
 def test_port_zero_becomes_a_free_port_and_others_stay():
     first, second = (bind_free_port("tcp/127.0.0.1:0") for _ in range(2))
     for endpoint in (first, second):
@@ -108,34 +99,6 @@ def test_percentiles_of_the_latency():
     assert tally.latency(50, 90) == {"count": 100, "p50": 50.5, "p90": 90.1, "max": 100.0}
     assert list(tally.by_code("not_localised").items()) == [("AMBIGUOUS", 50), ("TOO_FEW_MATCHES", 50)]
     assert (tally.count("not_localised"), tally.count("error")) == (100, 0)
-
-
-@pytest.fixture
-def three_threads():
-    """OpenCV's, whatever the environment says that the tests run in."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(3)
-    yield
-    cv2.setNumThreads(before)
-
-
-def test_threads_are_capped_within_the_block_and_restored_after_it(three_threads):
-    with capped_process(1):
-        assert cv2.getNumThreads() == 1
-        seen = []
-        thread = threading.Thread(
-            # FAISS's OpenBLAS runs on OpenMP, whose limit belongs to a thread: capped_thread sets it.
-            target=lambda: seen.extend(
-                p["num_threads"]
-                for p in threadpool_info()
-                if p["user_api"] == "blas" and p["threading_layer"] == "pthreads"
-            )
-        )
-        thread.start()
-        thread.join()
-        assert seen
-        assert set(seen) == {1}
-    assert cv2.getNumThreads() == 3
 
 
 def test_every_reason_has_advice():

@@ -4,13 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from featuredb.simworld.camera.photograph import look_pose
 from reloc.tracking.flow_track import Landmarks, follow
-from reloc.tracking.options import FlowOptions, TrackOptions
+from reloc.tracking.options import FlowOptions
 from reloc.tracking.pose_fit import fit_pose
 
 CAMERA = Camera(model="RADIAL", width=1280, height=720, params=(970.0, 641.0, 359.0, -0.03, 0.01))
@@ -140,8 +139,3 @@ def test_a_point_that_is_matched_again_has_its_new_pixel() -> None:
     joined = old.joined(new)
     assert sorted(joined.rows.tolist()) == [0, 1]
     assert joined.pixels[joined.rows == 1].tolist() == [[21.0, 22.0]]
-
-
-def test_a_track_that_never_catches_up_is_refused() -> None:
-    with pytest.raises(InvalidValueError, match="catch_up: expected 2 frames or more, found 1"):
-        TrackOptions(catch_up=1)

@@ -1,8 +1,11 @@
 """Frames that are read ahead: the same, in the same order, with their errors where they belong."""
 
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +14,7 @@ import pytest
 from featuredb.errors import VideoError
 from featuredb.video.film import Video, VideoFrame, VideoReport
 from featuredb.video.frames import open_video
-from reloc.tracking.track_video import ReadAhead
+from reloc.tracking.track_video import read_ahead
 from tests.support.films import film, read
 
 
@@ -39,17 +42,17 @@ class _Film(Video):
             yield frame
 
 
-@pytest.mark.parametrize("pattern", [(0,), (1,), (4,), (0, 7, 0, 0, 2), (100,)])
-def test_frames_are_those_of_the_film_however_far_it_is_read_ahead(
-    tmp_path: Path, pattern: tuple[int, ...]
+@pytest.mark.parametrize("pattern", [(False,), (True,), (False, True, False, False)])
+def test_frames_are_those_of_the_film_whenever_they_are_read_ahead(
+    tmp_path: Path, pattern: tuple[bool, ...]
 ) -> None:
+    idle = cycle(pattern)
     path = film(tmp_path, "mp4", 50)
     expected = read(path)
-    with open_video(path) as video, ReadAhead(video) as ahead:
+    with open_video(path) as video:
         found = []
-        for frame in ahead:
+        for frame in read_ahead(video, lambda: next(idle)):
             found.append(frame)
-            ahead.read_on(pattern[len(found) % len(pattern)])
             # Colours are made here while greys are made there.
             np.testing.assert_array_equal(frame.rgb(), expected[len(found) - 1].rgb())
         report = video.report
@@ -57,32 +60,26 @@ def test_frames_are_those_of_the_film_however_far_it_is_read_ahead(
     for frame, same in zip(found, expected, strict=True):
         np.testing.assert_array_equal(frame.gray, same.gray)
     assert not report.complaints()
-    assert ahead.seconds > 0.0
 
 
 def test_an_error_comes_after_the_frames_before_it(tmp_path: Path) -> None:
-    broken = _Film(film(tmp_path, "mp4"), breaks_after=12)
-    with ReadAhead(broken) as ahead:
-        frames = iter(ahead)
-        for _ in range(12):
-            next(frames)
-            ahead.read_on(6)
-        with pytest.raises(VideoError, match="broken here"):
-            next(frames)
+    frames = read_ahead(_Film(film(tmp_path, "mp4"), breaks_after=12))
+    for _ in range(12):
+        next(frames)
+    with pytest.raises(VideoError, match="broken here"):
+        next(frames)
 
 
-def test_no_more_are_read_ahead_than_wanted_and_of_a_live_source_none(tmp_path: Path) -> None:
-    path = film(tmp_path, "mp4")
-    for live, most in ((False, 5), (True, 0)):
-        source = _Film(path, live=live)
-        with ReadAhead(source, most=5) as ahead:
-            frames = iter(ahead)
-            next(frames)
-            ahead.read_on(3)
-            ahead.read_on(30)
-        assert source.read <= 1 + most  # the last may be cancelled as it is left
-        with ReadAhead(_Film(path, live=live), most=5) as ahead:
-            assert sum(1 for _ in ahead) == 30
+@pytest.mark.parametrize(("live", "most"), [(False, 5), (True, 0)])
+def test_no_more_are_read_ahead_than_wanted_and_of_a_live_source_none(
+    tmp_path: Path, live: bool, most: int
+) -> None:
+    source = _Film(film(tmp_path, "mp4"), live=live)
+    frames = read_ahead(source, most=5)
+    next(frames)
+    frames.close()
+    assert source.read <= 1 + most
+    assert sum(1 for _ in read_ahead(_Film(film(tmp_path, "mp4"), live=live), most=5)) == 30
 
 
 @pytest.mark.parametrize(
@@ -96,25 +93,19 @@ def test_large_films_are_read_ahead_as_far_as_their_memory_goes(
     source.info = replace(
         source.info, width=width, height=height, frame_width=small[0], frame_height=small[1]
     )
-    with ReadAhead(source) as ahead:
-        frames = iter(ahead)
+    frames, used = read_ahead(source), 12
+    for _ in range(used):
         next(frames)
-        ahead.read_on(100)
-        for _ in range(most):  # from the background, and none is read for them
-            next(frames)
-        assert source.read == 1 + most
-
-
-def test_before_the_first_frame_nothing_is_read_ahead(tmp_path: Path) -> None:
-    with ReadAhead(_Film(film(tmp_path, "mp4"))) as ahead:
-        ahead.read_on(5)
-        assert [frame.index for frame in ahead] == list(range(30))
+    end = time.monotonic() + 20.0
+    while source.read < used + most - 1:  # the last one is in use
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    time.sleep(0.05)
+    assert source.read == used + most - 1
+    frames.close()
 
 
 def test_a_film_that_is_left_early_has_no_thread_left(tmp_path: Path) -> None:
-    with open_video(film(tmp_path, "mp4")) as video, ReadAhead(video) as ahead:
-        for frame in ahead:
-            ahead.read_on(10)
-            if frame.index == 3:
-                break
+    with open_video(film(tmp_path, "mp4")) as video, closing(read_ahead(video)) as frames:
+        next(frames)
     assert not [t.name for t in threading.enumerate() if t.name.startswith("decoding")]

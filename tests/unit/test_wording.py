@@ -10,7 +10,7 @@ from featuredb.geo.geopose import BODY_FROM_CAM
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rotation import quaternion_from_matrix
-from reloc.reply import reply_from_result
+from reloc.service.handler import reply_from_result
 from reloc.wire.query import LocaliseReply, OwnPositionUse, Quaternion
 from reloc.wording import describe
 from tests.support.service import localised, not_localised

@@ -20,7 +20,7 @@ from reloc.service.handler import answer_query
 from reloc.service.workers import answering, process
 from reloc.service.workers.answering import WorkerLimits
 from reloc.service.workers.area_files import AreaFiles, MappedAreas
-from reloc.service.workers.process import WorkerEndedError, WorkerProcess
+from reloc.service.workers.process import WorkerFailedError, WorkerProcess
 from tests.support.field_queries import moved
 from tests.support.maps import random_map
 
@@ -43,7 +43,7 @@ def test_too_many_open_files_are_a_process_that_does_not_come_up(monkeypatch):
         raise OSError(errno.EMFILE, "too many open files")
 
     monkeypatch.setattr(process, "_CONTEXT", SimpleNamespace(Pipe=none_left))
-    with pytest.raises(WorkerEndedError):
+    with pytest.raises(WorkerFailedError):
         WorkerProcess(LIMITS, ANSWERER)
 
 

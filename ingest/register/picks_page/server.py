@@ -6,7 +6,7 @@ below a random token that other web pages cannot know: none can read or post her
 
 import secrets
 from functools import partial
-from importlib import resources
+from pathlib import Path
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
@@ -14,10 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from featuredb.errors import FeatureDbError
 from ingest.register.picks_page.session import PickedSpot, PickSession
-from reloc.viewer.page import assets_of
 from reloc.viewer.server import local_app
 
-_PACKAGE = "ingest.register.picks_page"
+_ASSETS = Path(__file__).with_name("assets")
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -37,8 +36,8 @@ def new_token() -> str:
 
 def create_app(session: PickSession, token: str) -> FastAPI:
     """The application; everything lies below /TOKEN/."""
-    html = (resources.files(_PACKAGE) / "assets" / "index.html").read_text(encoding="utf-8")
-    app, in_thread = local_app("featuredb picks", html, _POLICY, assets_of(_PACKAGE, ""), f"/{token}")
+    html = (_ASSETS / "index.html").read_text(encoding="utf-8")
+    app, in_thread = local_app("featuredb picks", html, _POLICY, _ASSETS, f"/{token}")
     api = f"/{token}/api"
 
     @app.get(f"{api}/state")

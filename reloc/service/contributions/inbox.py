@@ -76,6 +76,9 @@ class Ticket:
     size: int
 
 
+_Given = tuple[Ticket, Callable[[], Contribution]]
+
+
 class Inbox:
     """Takes photos from the workers; they share it."""
 
@@ -88,11 +91,11 @@ class Inbox:
         self._store, self._count = write, count
         self._options = options or InboxOptions()
         self._changed = threading.Condition()
-        self._queue: deque[tuple[Ticket, Callable[[], Contribution]]] = deque()
+        self._queue: deque[_Given] = deque()
         self._places: set[Ticket] = set()  # that are given out and not yet written
         self._counts = InboxCounts(by_state={}, waiting_by_owner={}, stored_bytes=0)
         self._counted_at = -1e9
-        self._limited = False  # someone was refused by the counts since they were taken
+        self._asked = False  # someone wanted a place since the counts were taken
         self._accepted = self._written = self._lost = 0
         self._refused: Counter[str] = Counter()
         self._error: str | None = None
@@ -119,6 +122,7 @@ class Inbox:
     def reserve(self, owner: str, size: int) -> Ticket | ContributionReply:
         """A place for a photo of `size` bytes, or why there is none. Returns at once."""
         with self._changed:
+            self._asked = True
             refusal = self._refusal(owner, size)
             if refusal is not None:
                 reason, detail = refusal
@@ -172,37 +176,23 @@ class Inbox:
             (waiting >= options.max_photos, "INBOX_FULL", of_all),
             (stored + size > options.max_stored_bytes, "INBOX_FULL", of_bytes),
         )
-        for reached, reason, told in limits:
-            if reached:
-                self._limited = True
-                self._changed.notify()
-                return reason, told
-        return None
+        return next(((reason, told) for reached, reason, told in limits if reached), None)
 
     def _run(self) -> None:
-        while (batch := self._next()) is not None:
+        while True:
+            with self._changed:
+                if not self._queue and not self._closed:
+                    self._changed.wait(self._options.refresh_s)
+                if not self._queue and self._closed:
+                    return
+                batch = [self._queue.popleft() for _ in range(min(len(self._queue), self._options.batch))]
             if batch:
                 self._write(batch)
-            with self._changed:
-                due = time.monotonic() - self._counted_at >= self._options.refresh_s
-                # The counts matter to those who were refused by them, and while the store was failing.
-                wanted = self._limited or self._error is not None or self._written > 0
-            if due and wanted:
+            due = time.monotonic() - self._counted_at >= self._options.refresh_s
+            if due and (self._asked or self._error is not None):
                 self._refresh()
 
-    def _next(self) -> "list[tuple[Ticket, Callable[[], Contribution]]] | None":
-        """What waits, at most a batch; nothing when counts are due; None once closed and empty."""
-        with self._changed:
-            while not self._queue and not self._closed:
-                if self._limited or self._error is not None:
-                    self._changed.wait(self._options.refresh_s)
-                    return []
-                self._changed.wait()
-            if not self._queue:
-                return None
-            return [self._queue.popleft() for _ in range(min(len(self._queue), self._options.batch))]
-
-    def _write(self, batch: "list[tuple[Ticket, Callable[[], Contribution]]]") -> None:
+    def _write(self, batch: list[_Given]) -> None:
         made = [(ticket, one) for ticket, make in batch if (one := _made(make)) is not None]
         if not (made and self._write_with_retries([one for _, one in made])):
             made = []
@@ -247,7 +237,7 @@ class Inbox:
             self._counts = counts or self._counts
             self._error = error
             self._counted_at = time.monotonic()
-            self._limited = False
+            self._asked = False
 
 
 def _made(make: Callable[[], Contribution]) -> Contribution | None:

@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError
 from featuredb.features.decode import decode_gray, probe
 from featuredb.features.shrink import fitted_size, shrunk
-from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from reloc.answered_view import geo_prior
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.reply import place_fields
-from reloc.service.handler import image_refused, query_camera
+from reloc.service.handler import image_refused, place_fields, query_camera
 from reloc.service.options import LiveOptions
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.tracker import Tracker
@@ -30,7 +28,6 @@ from reloc.wire.track import TrackOpenRequest, TrackPose
 
 # Pixels to decode that 4K video has at most. Frames of more are served behind queries.
 _VIDEO_PIXELS = 4096 * 2160
-_PLACE = ("position", "quaternion", "height_datum", "utm", "covariance", "accuracy", "camera", "map_id")
 _YIELDING = 10  # niceness: a ninth of the processor that a query gets beside it
 
 
@@ -139,13 +136,13 @@ def pose_message(point: TrajectoryPoint, camera: Camera | None, **about: Any) ->
 
     `about`: the other fields of TrackPose; a time goes before the point's.
     """
-    pose: dict[str, Any] = dict.fromkeys(_PLACE)
+    pose: dict[str, Any] = {}
     if point.pose is not None:
         assert camera is not None
         lens = Intrinsics(**asdict(camera))
         pose = {**place_fields(point.pose), "camera": lens, "map_id": point.pose.map_id}
     same = {name: getattr(point, name) for name in ("time_s", "state", "detail", "inliers")}
-    return TrackPose(body_axes=BODY_AXES, **same | about | pose)
+    return TrackPose(**same | about | pose)
 
 
 def _yield_to_queries() -> None:

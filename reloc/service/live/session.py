@@ -16,7 +16,7 @@ from reloc.service.live.frames import FrameAnswerer, FrameAsk
 from reloc.service.logs import Tally, fields
 from reloc.service.options import ServeOptions
 from reloc.service.workers.area_files import LocaliserFiles
-from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
+from reloc.service.workers.process import WorkerFailedError, WorkerProcess
 from reloc.wire.query import ErrorCode, RequestError, bad_request, parse_attachment
 from reloc.wire.track import EndReason, TrackEvent, TrackFrame, TrackPose
 
@@ -57,10 +57,10 @@ class Follower:
         self._stopped = False
 
     def __enter__(self) -> Self:
-        """Raises WorkerEndedError: no process comes up, or as told."""
+        """Raises WorkerFailedError: no process comes up, or as told."""
         try:
-            self._ready()
-        except WorkerEndedError:
+            self._ready().open(self._files())
+        except WorkerFailedError:
             self._close()
             raise
         return self
@@ -80,7 +80,7 @@ class Follower:
 
         Raises:
             RequestError: a header that goes back, what `FrameAnswerer.answer` refuses, or a frame that is
-                beyond the limits or ends the process. WorkerEndedError: it was told to stop.
+                beyond the limits or ends the process. WorkerFailedError: it was told to stop.
         """
         clock = StageClock(start=arrival.received)
         self._check(header, arrival.size)
@@ -93,40 +93,28 @@ class Follower:
                 dropped=header.sequence + 1 - self._looked_at,
                 received_at=arrival.received_at.isoformat(),
             )
-            pose = self._asked(process, frame, arrival.payload)
-        except (WorkerEndedError, WorkerDefectError) as error:
+            late = RequestError(
+                ErrorCode.DEADLINE, f"the frame was not done within {self._frame_s:g} s; send smaller ones"
+            )
+            pose = process.ask(self._files(), frame, arrival.payload, TrackPose, self._frame_s, late)
+        except WorkerFailedError as error:
             self._close()
             if self._stopped:
                 raise
             logger.exception("a frame failed", extra=fields("frame_failed"))
-            how = error if isinstance(error, WorkerEndedError) else "a defect"
-            text = f"{how} on this frame; the server's log has it. The track begins anew"
+            text = f"{error} on this frame; the server's log has it. The track begins anew"
             raise RequestError(ErrorCode.INTERNAL, text) from error
         self._last_time_s = header.time_s
         clock.lap("worker", pose.timings_ms)
         return pose.model_copy(update={"timings_ms": clock.milliseconds()})
 
-    def _asked(self, process: WorkerProcess, frame: FrameAsk, data: bytes) -> TrackPose:
-        watch = threading.Timer(self._frame_s, process.kill)
-        watch.start()
-        try:
-            return process.ask(frame, data, TrackPose)
-        except WorkerEndedError as error:
-            if self._stopped or not process.killed:
-                raise
-            text = f"the frame was not done within {self._frame_s:g} s; send smaller ones"
-            raise RequestError(ErrorCode.DEADLINE, text) from error
-        finally:
-            watch.cancel()
-
     def _ready(self) -> WorkerProcess:
-        """The process, a new one where it has ended, over the area in service."""
+        """The process, a new one where it has ended."""
         if self._process is None or not self._process.is_alive():
             self._close()
             self._process = WorkerProcess(self._limits, self._answerer.answer)
             if self._stopped:  # while it was started
                 self._process.kill()
-        self._process.open(self._files())
         return self._process
 
     def _close(self) -> None:
@@ -234,7 +222,7 @@ class LiveSession:
             with self._follower:
                 self._answer_frames()
         except Exception as error:
-            if not (self._cut_off and isinstance(error, WorkerEndedError)):
+            if not (self._cut_off and isinstance(error, WorkerFailedError)):
                 logger.exception("live session failed", extra=fields("internal", session=self.name))
                 self.end(EndReason.INTERNAL)
         self._on_end()

@@ -19,6 +19,7 @@ from reloc.service.live.session import Arrival, Follower, LiveSession
 from reloc.service.logs import Tally, fields
 from reloc.service.options import LiveOptions
 from reloc.service.queueing import session_of
+from reloc.service.session import JSON, publish
 from reloc.service.source import ServedArea
 from reloc.wire.keys import NAME_EXPECTED, Keys, is_name
 from reloc.wire.query import (
@@ -41,8 +42,6 @@ from reloc.wire.track import (
 )
 
 logger = logging.getLogger(__name__)
-
-_JSON = zenoh.Encoding.APPLICATION_JSON
 
 
 class LiveSessions:
@@ -126,13 +125,13 @@ class LiveSessions:
                 text = "the server failed to open the session; its log says why"
                 self._refuse(query, client, name, RequestError(ErrorCode.INTERNAL, text))
                 return
-            query.reply(self._keys.track(client, name), reply, encoding=_JSON)
+            query.reply(self._keys.track(client, name), reply, encoding=JSON)
         logger.info("live session opened", extra=fields("live_opened", client=client, session=name))
 
     def _refuse(self, query: zenoh.Query, client: str, name: str, error: RequestError) -> None:
         self._tally.add("refused", error.code)
         refusal = ErrorReply(code=error.code, message=error.message, request_id=None)
-        query.reply_err(encode(refusal), encoding=_JSON)
+        query.reply_err(encode(refusal), encoding=JSON)
         asked = {"client": client[:80], "session": name[:80]}
         said = {"code": error.code, "refusal": error.message}
         logger.info("live session refused", extra=fields("live_refused", **asked, **said))
@@ -251,14 +250,5 @@ class LiveSessions:
             del self._open[key]
 
     def _publish(self, key: str, message: BaseModel) -> None:
-        try:
-            # A client that does not read loses poses; nobody waits for it.
-            self._session.put(
-                key,
-                encode(message),
-                encoding=_JSON,
-                congestion_control=zenoh.CongestionControl.DROP,
-                express=True,
-            )
-        except zenoh.ZError:
-            logger.warning("a live session's message could not be published", exc_info=True)
+        # A client that does not read loses poses; nobody waits for it.
+        publish(self._session, key, message, zenoh.CongestionControl.DROP)

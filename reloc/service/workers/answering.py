@@ -6,8 +6,7 @@ import resource
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
@@ -40,18 +39,6 @@ class WorkerLimits:
     processor_s: float  # of all threads together
 
 
-@contextmanager
-def capped_process(count: int) -> Iterator[None]:
-    """Within the block OpenCV and BLAS use at most `count` threads, in all threads of the process."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(count)
-    try:
-        with threadpool_limits(limits=count):
-            yield
-    finally:
-        cv2.setNumThreads(before)
-
-
 class _Stop:
     """SIGTERM ends an idle process at once, and one that has a picture in hand after it."""
 
@@ -74,28 +61,29 @@ def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer)
     stop, areas = _Stop(), MappedAreas()
     localiser: Localiser | None = None
     unlimited = resource.getrlimit(resource.RLIMIT_AS)
-    with capped_process(limits.threads):
-        while not stop.wanted:
-            try:
-                message = connection.recv()
-                stop.busy = True
-                if isinstance(message, tuple):
-                    resource.setrlimit(resource.RLIMIT_AS, unlimited)
-                    localiser = _opened(connection, message, areas)
-                    answer = b""
-                else:
-                    data = connection.recv_bytes()
-                    assert localiser is not None
-                    _limit(limits)
-                    answer = _answer(answerer, message, data, localiser)
-                connection.send_bytes(answer)
-            except (EOFError, OSError):
-                return
-            except (MemoryError, cv2.error) as error:
-                if not _is_out_of_memory(error):
-                    raise
-                os._exit(OUT_OF_MEMORY)
-            stop.busy = False
+    cv2.setNumThreads(limits.threads)
+    threadpool_limits(limits.threads)
+    while not stop.wanted:
+        try:
+            message = connection.recv()
+            stop.busy = True
+            if isinstance(message, tuple):
+                resource.setrlimit(resource.RLIMIT_AS, unlimited)
+                localiser = _opened(connection, message, areas)
+                answer = b""
+            else:
+                data = connection.recv_bytes()
+                assert localiser is not None
+                _limit(limits)
+                answer = _answer(answerer, message, data, localiser)
+            connection.send_bytes(answer)
+        except (EOFError, OSError):
+            return
+        except (MemoryError, cv2.error) as error:
+            if not _is_out_of_memory(error):
+                raise
+            os._exit(OUT_OF_MEMORY)
+        stop.busy = False
 
 
 def _opened(connection: Connection, keys: tuple[int, ...], areas: MappedAreas) -> Localiser:

@@ -4,7 +4,6 @@ import logging
 import math
 import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 
@@ -14,11 +13,11 @@ from reloc.service.contributions.inbox import Inbox, contribution_of
 from reloc.service.handler import answer_query
 from reloc.service.logs import fields
 from reloc.service.options import ServeOptions
-from reloc.service.queueing import PendingQuery, QueryQueue, deadline_error
+from reloc.service.queueing import PendingQuery, QueryQueue
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
 from reloc.service.workers.area_files import AreaFiles
-from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
+from reloc.service.workers.process import WorkerFailedError, WorkerProcess
 from reloc.wire.query import (
     ContributionReply,
     ErrorCode,
@@ -44,8 +43,6 @@ class WorkerPool:
         self._limits = options.worker_limits
         self._answerer = partial(answer_query, limits=options.limits)
         self._files = AreaFiles()
-        # A photo is named while it is localised: the query does not wait for a hash of its megabytes.
-        self._namer = ThreadPoolExecutor(1, thread_name_prefix="name-photo")
         self._busy: dict[PendingQuery, WorkerProcess | None] = {}
         self._up: set[WorkerProcess] = set()
         self._failed: dict[str, str] = {}  # why a worker's latest process did not come up, by its thread
@@ -98,7 +95,6 @@ class WorkerPool:
         self._closing.set()
         for thread in self._threads:
             thread.join(max(0.0, end - time.perf_counter()))
-        self._namer.shutdown(wait=False, cancel_futures=False)
         with self._changed:
             return list(self._busy)
 
@@ -161,17 +157,13 @@ class WorkerPool:
         except RequestError as error:
             item.request_id = error.request_id or item.request_id
             item.refuse(error)
-        except WorkerEndedError as error:
-            with self._changed:
-                self._up.discard(process)
-            what = f"{error} on this query, which concerns no other; the server's log has it"
-            item.refuse(RequestError(ErrorCode.INTERNAL, f"{what} under request id {item.request_id}"))
         except Exception as error:
-            trace = {"trace": str(error)} if isinstance(error, WorkerDefectError) else {}
-            told = fields("internal", request_id=item.request_id, **trace)
-            logger.exception("query failed", extra=told)
-            what = "the server failed on this query; its log says why"
-            item.refuse(RequestError(ErrorCode.INTERNAL, f"{what} under request id {item.request_id}"))
+            if item.answered:  # and the process ended since
+                return
+            logger.exception("query failed", extra=fields("internal", request_id=item.request_id))
+            what = error if isinstance(error, WorkerFailedError) else "the server failed"
+            text = f"{what} on this query, which concerns no other; the server's log says why"
+            item.refuse(RequestError(ErrorCode.INTERNAL, f"{text} under request id {item.request_id}"))
 
     def _localise(self, item: PendingQuery, process: WorkerProcess) -> None:
         clock = StageClock(start=item.received)
@@ -183,27 +175,23 @@ class WorkerPool:
             text = f"contribute: this server takes no contributions; {instead}"
             raise RequestError(ErrorCode.UNSUPPORTED, text)
         wished_s = (request.options.deadline_ms or math.inf) / 1e3
-        end = min(item.received + wished_s, time.perf_counter() + self._options.work_s)
-        if end < item.deadline:
-            item.deadline = end
-            _check_deadline(item)  # one that is over already must not end a process that has nothing in hand
-            item.watch()
-        _check_deadline(item)
+        work_end = time.perf_counter() + self._options.work_s
+        item.deadline = min(item.deadline, item.received + wished_s, work_end)
         data = item.bytes_of("payload")
         clock.lap("request")
         if item.answered:
             return
-        name = self._namer.submit(candidate_id_of, data) if request.contribute else None
-        process.open(self.published)
         asked = request.model_copy(update={"request_id": item.request_id})
-        reply = process.ask(asked, data, LocaliseReply)
+        left_s = item.deadline - time.perf_counter()
+        if left_s <= 0.0:
+            raise item.deadline_error()
+        reply = process.ask(self.published, asked, data, LocaliseReply, left_s, item.deadline_error())
         clock.lap("worker", reply.timings_ms)
         reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
-        _check_deadline(item)
-        if name is None:
-            item.answer(reply)
+        if request.contribute:
+            self._answer_and_keep(item, data, request, reply, clock)
         else:
-            self._answer_and_keep(item, data, request, reply, clock, name)
+            item.answer(reply)
 
     def _answer_and_keep(
         self,
@@ -212,7 +200,6 @@ class WorkerPool:
         request: LocaliseWireRequest,
         reply: LocaliseReply,
         clock: StageClock,
-        name: Future[str],
     ) -> None:
         """Answer, and hand the photo to the inbox if it has a place; what the answer says is then done."""
         assert self._inbox is not None
@@ -230,16 +217,10 @@ class WorkerPool:
             return
         answered = False
         try:
-            queued = "queued for the inbox"
-            said = ContributionReply(accepted=True, candidate_id=name.result(), reason=None, detail=queued)
-            answered = answer(said)
+            name, queued = candidate_id_of(data), "queued for the inbox"
+            answered = answer(ContributionReply(accepted=True, candidate_id=name, reason=None, detail=queued))
         finally:
             if not answered:
                 self._inbox.cancel(place)
         if answered:
             self._inbox.submit(place, lambda: contribution_of(data, request, reply, received_at, owner))
-
-
-def _check_deadline(item: PendingQuery) -> None:
-    if time.perf_counter() >= item.deadline:
-        raise deadline_error(item)

@@ -5,6 +5,7 @@ import resource
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.reduction import send_handle
@@ -28,6 +29,7 @@ from reloc.wire.query import ErrorCode, ErrorReply, RequestError
 _CONTEXT = multiprocessing.get_context("forkserver")
 _STARTING = threading.Lock()
 _Reply = TypeVar("_Reply", bound=BaseModel)
+_NOT_STARTED = "no worker process can be started"
 _JOIN_S = 5.0  # for one that has ended or is killed
 
 
@@ -57,27 +59,19 @@ def _without_script() -> Iterator[None]:
             sys.modules["__main__"] = own
 
 
-class WorkerEndedError(Exception):
-    """The process has ended before it answered."""
-
-    def __init__(self, code: int | None) -> None:
-        how = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
-        super().__init__(f"the worker process ended with {how}")
-
-
-class WorkerDefectError(Exception):
-    """The picture met a defect; the message is the traceback in the worker."""
+class WorkerFailedError(Exception):
+    """The process has ended before it answered, or met a defect; the message is for the client, too."""
 
 
 class WorkerProcess:
     """A process that answers one message at a time; of one thread, but for `kill`."""
 
     def __init__(self, limits: WorkerLimits, answerer: Answerer) -> None:
-        """Raises WorkerEndedError where no process can be started."""
+        """Raises WorkerFailedError where no process can be started."""
         try:
             self._connection, theirs = _CONTEXT.Pipe()
         except OSError as error:  # too many open files
-            raise WorkerEndedError(None) from error
+            raise WorkerFailedError(_NOT_STARTED) from error
         self._limits = limits
         self._open: LocaliserFiles | None = None
         self.killed = False  # by `kill`
@@ -89,7 +83,7 @@ class WorkerProcess:
                 self._process.start()
         except (EOFError, OSError) as error:  # no memory, or whom it is forked from has ended
             self._connection.close()
-            raise WorkerEndedError(None) from error
+            raise WorkerFailedError(_NOT_STARTED) from error
         finally:
             theirs.close()
 
@@ -98,7 +92,7 @@ class WorkerProcess:
         return not self.killed and not self._connection.poll() and self._process.is_alive()
 
     def kill(self) -> None:
-        """From any thread: whoever waits for an answer gets WorkerEndedError."""
+        """From any thread: whoever waits for an answer gets WorkerFailedError."""
         self.killed = True
         self._process.kill()
 
@@ -112,7 +106,7 @@ class WorkerProcess:
         """Answer from this localiser; does nothing where it does already.
 
         Raises:
-            WorkerEndedError: the process has ended.
+            WorkerFailedError: the process has ended.
         """
         if files is self._open:
             return
@@ -125,19 +119,33 @@ class WorkerProcess:
             raise self._ended() from error
         self._open = files
 
-    def ask(self, ask: object, data: bytes, reply: type[_Reply]) -> _Reply:
-        """What the process's answerer answers about an image file, read as `reply`.
+    def ask(
+        self,
+        files: LocaliserFiles,
+        ask: object,
+        data: bytes,
+        reply: type[_Reply],
+        time_s: float,
+        late: RequestError,
+    ) -> _Reply:
+        """What the process's answerer answers about an image file, from a localiser, read as `reply`.
 
         Raises:
+            late: it took longer than `time_s`, and the process is killed.
             RequestError: why there is no answer; TOO_LARGE where the process has ended for want of memory.
-            WorkerEndedError: the process has ended otherwise.
-            WorkerDefectError: a defect.
+            WorkerFailedError: the process has ended otherwise, or there was a defect.
         """
+        end = time.perf_counter() + time_s
+        watch = threading.Timer(time_s, self.kill)  # one that has stopped does not even read
+        watch.start()
         try:
+            self.open(files)
             self._connection.send(ask)
             self._connection.send_bytes(data)
             answer = self._connection.recv_bytes()
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError, WorkerFailedError) as error:
+            if time.perf_counter() >= end:
+                raise late from error
             ended = self._ended()
             if self._process.exitcode != OUT_OF_MEMORY:
                 raise ended from error
@@ -146,14 +154,18 @@ class WorkerProcess:
                 f"the picture needs more than the {self._limits.memory_bytes >> 20} MiB of memory that it "
                 "may; send a smaller one",
             ) from error
+        finally:
+            watch.cancel()
         kind, content = answer[:1], answer[1:]
         if kind == DEFECT:
-            raise WorkerDefectError(content.decode())
+            raise WorkerFailedError("the server failed") from RuntimeError(content.decode())
         if kind == REFUSAL:
             refusal = ErrorReply.model_validate_json(content)
             raise RequestError(ErrorCode(refusal.code), refusal.message)
         return reply.model_validate_json(content)
 
-    def _ended(self) -> WorkerEndedError:
+    def _ended(self) -> WorkerFailedError:
         self._process.join(_JOIN_S)
-        return WorkerEndedError(self._process.exitcode)
+        code = self._process.exitcode
+        how = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
+        return WorkerFailedError(f"the worker process ended with {how}")

@@ -54,5 +54,5 @@ async function answered(call) {
   const response = await call;
   if (response.ok) return response;
   const told = await response.json().catch(() => ({}));
-  throw new Error(told.message ?? `the server answers ${response.status}`);
+  throw new Error(told.message ?? told.detail ?? `the server answers ${response.status}`);
 }
