@@ -288,7 +288,7 @@ def _quarantine_note(quarantined: Mapping[str, str]) -> tuple[str, ...]:
         ids = [map_id for map_id, of in quarantined.items() if of == reason]
         way = "--trust-geotags believes the geotags" if reason == HINTS else "; ".join(WAYS_TO_A_PLACE)
         notes.append(
-            f"{len(ids)} maps ({', '.join(ids[:3])}{', ...' if len(ids) > 3 else ''}) stay in quarantine: "
+            f"Maps in quarantine ({len(ids)}: {', '.join(ids[:3])}{', ...' if len(ids) > 3 else ''}): "
             f"{reason}. They answer only queries that name them, until something better confirms them: {way}."
         )
     return tuple(notes[:_MOST_NOTES])

@@ -191,4 +191,4 @@ def test_positions_of_a_table_place_active_maps_only_when_they_are_trusted(
     assert reasons == {"gone.jpg": "missing", "row 11": "bad_row"}
     assert "ignored: camera club" in report.warnings[0]
     assert "row 11 is left out" in report.warnings[1]
-    assert ("stay in quarantine" in report.warnings[-1]) == (not trust)
+    assert ("Maps in quarantine" in report.warnings[-1]) == (not trust)
