@@ -50,6 +50,7 @@ _RIVALS = 20  # the best of other places that are compared one by one
 _LEAST_TRIES = 20  # elsewhere: fewer do not tell what chance gives
 _LIKE_SIZE = 0.5  # logarithm: sizes at which chance is alike; of a smaller map more agrees anywhere
 _TAIL = 0.25  # share of the places elsewhere whose scores are taken for the tail of what chance gives
+_TOGETHER = 2.5  # mean of such a tail, at least: the median of eight searches without a right place was 2.4
 _WALL_SIGMA_M = 0.15  # of all outlines together, outwards: eaves, and a laser's footprint
 _LEAST_SIGMA_M = 0.05  # of a point
 
@@ -234,15 +235,15 @@ def _judged(
 def _log_nfa(best: float, elsewhere: FloatArray) -> float:
     """-log10 of how many of so many places elsewhere would agree as well.
 
-    The tail of logarithms of likelihoods is exponential, of mean 1 where all points of a map err by
-    themselves, and of more as they err together: a mean that its members tell no better than so many can
-    (Lomax).
+    The tail of logarithms of likelihoods is exponential, of mean 1 where all places of a map agree by
+    themselves, and of more as those of one wall agree together: a mean that its members tell no better than
+    so many can (Lomax).
     """
     if len(elsewhere) < _LEAST_TRIES:
         return 0.0
     start = float(np.quantile(elsewhere, 1.0 - _TAIL))
     tail = elsewhere[elsewhere >= start] - start
-    mean = max(float(tail.mean()), 1.0)
+    mean = max(float(tail.mean()), _TOGETHER)
     further = max(best - start, 0.0) / (len(tail) * mean)
     return float(len(tail) * np.log10(1.0 + further) - np.log10(len(tail)))
 
