@@ -33,6 +33,7 @@ _AGREE_M, _NEAR_M = 0.3, 1.0  # of a point from the solid: across its plane, and
 _ABOVE_M = 1.0  # over the ground: the ground agrees everywhere
 _PLACE_M = 3.0  # side of what counts as one place: what lies closer together errs together
 _EYE_M = 1.6  # of people over the ground, from which a fit starts
+_LOWEST_M, _HIGHEST_M = 0.5, 3.0  # and where a fit may leave the median of them
 _NEAREST_M, _FURTHEST_M = 3.0, 100.0  # medians from which people take photos of fronts
 _COARSE, _ASKED, _FINE = 400, 1500, 4000  # points of a fit, of a place's evidence, of the last fit
 _COARSE_WIDTHS_M = (2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5)
@@ -111,7 +112,7 @@ def _place(unplaced: UnplacedMap, cloud: PointCloud, tests: int) -> GroundPlace:
     there = _tried(plan, shape, PlanSearch(shape), tags)
     if len(there) < _LEAST_TRIES:
         return GroundPlace(reason="STRUCTURE", message="it fits hardly anywhere on the scan")
-    return _judged(unplaced, plan, shape, there, tests)
+    return _judged(unplaced, plan, shape, tags, there, tests)
 
 
 def geotags_of(unplaced: UnplacedMap, cloud: PointCloud) -> Geotags | None:
@@ -135,6 +136,12 @@ def _tried(plan: StreetPlan, shape: ScanShape, search: PlanSearch, tags: Geotags
     fits = [_fitted(plan, shape, _start(plan, shape, one), rows, _COARSE_WIDTHS_M) for one in found]
     asked = np.random.default_rng(0).permutation(len(plan.points))[:_ASKED]
     return [_asked(shape, laid(shape, plan.points[asked], fit.local_from_own)) for fit in fits]
+
+
+def _eyes_m(centers: FloatArray, shape: ScanShape, sim: Sim3) -> float:
+    """How high over the ground cameras (n, 3) are, in the median."""
+    placed = sim.act(centers)
+    return float(np.median(placed[:, 2] - shape.ground[shape.cells(placed[:, :2])]))
 
 
 def _chance(there: Sequence[_Tried]) -> FloatArray:
@@ -178,11 +185,24 @@ def _asked(shape: ScanShape, fit: SolidFit) -> _Tried:
 
 
 def _judged(
-    unplaced: UnplacedMap, plan: StreetPlan, shape: ScanShape, there: Sequence[_Tried], tests: int
+    unplaced: UnplacedMap,
+    plan: StreetPlan,
+    shape: ScanShape,
+    tags: Geotags | None,
+    there: Sequence[_Tried],
+    tests: int,
 ) -> GroundPlace:
     """The photos that lie there, fitted, and whether another place explains them as well."""
     chance = _chance(there)
+    eyes_m = np.array([_eyes_m(plan.centers, shape, one.fit.local_from_own) for one in there])
+    stands = np.flatnonzero((eyes_m > _LOWEST_M) & (eyes_m < _HIGHEST_M))
+    if not len(stands):
+        words = "nowhere would its cameras be as high as people hold them"
+        return GroundPlace(reason="STRUCTURE", message=words)
+    there, chance = [there[k] for k in stands.tolist()], chance[stands]
     scores = np.array([_score(one, share) for one, share in zip(there, chance, strict=True)])
+    if tags is not None:
+        scores += [tags.log_likelihood(one.fit.local_from_own.act(plan.centers)[:, :2]) for one in there]
     first = int(scores.argmax())
     rate = float(chance[first])
     kept = np.ones(len(unplaced.images), dtype=bool)
@@ -198,6 +218,12 @@ def _judged(
     if kept.sum() < _LEAST_PHOTOS:
         few = f"{int(kept.sum())} of its photos lie on the scan"
         return GroundPlace(reason="TOO_FEW_FRAMES", message=few)
+    high_m = _eyes_m(plan.centers[kept], shape, sim)
+    if not _LOWEST_M < high_m < _HIGHEST_M:
+        words = (
+            f"its cameras would be {high_m:.1f} m over the ground, {_LOWEST_M} to {_HIGHEST_M} m are usual"
+        )
+        return GroundPlace(reason="STRUCTURE", message=words)
     rows = _rows_seen(unplaced, plan, kept)
     there_m = (one.fit.local_from_own.act(plan.points[rows]) - sim.act(plan.points[rows]) for one in there)
     away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])

@@ -43,6 +43,11 @@ class Geotags:
         squared = np.square((off - np.median(off, axis=0)) / self.sigma_m[:, None]).sum(axis=1)
         return float(np.minimum(squared, _WRONG).sum())
 
+    def log_likelihood(self, centers: FloatArray) -> float:
+        """Of all photos' places (c, 2), less that of the tags' own; each tag's is bounded: some are wrong."""
+        off = (self.xy - centers[self.rows]) / (_LOOSE * self.sigma_m[:, None])
+        return -0.5 * float(np.minimum(np.square(off).sum(axis=1), _WRONG).sum())
+
     def circle(self, plan: StreetPlan, size: float, turn: float) -> Circle:
         """x, y and radius of where the middle of the plan's cameras may be."""
         return self._about(self._offsets(plan, size, turn), _NEAR_M)
