@@ -131,6 +131,10 @@ def _query(args: argparse.Namespace) -> int:
     from reloc.client import Client
 
     camera, told = _told(args)
+    if args.contribute and not (args.credit and args.licence):
+        raise InvalidValueError(
+            "--contribute: expected --credit and --licence, too: whom to name with them, and the terms"
+        )
     require_an_image(args.image)
     with Client(args.connect, args.database, config_path=args.config) as client:
 
@@ -249,7 +253,9 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
         try:
             data = path.read_bytes()
             reply, _ = ask(data, None, True)
-        except (OSError, FeatureDbError):
+        except (OSError, FeatureDbError) as error:
+            if isinstance(error, ServiceError) and error.code == "NO_SERVER":
+                break
             continue  # said when it is asked for again
         if reply.camera is not None:
             exif = read_exif(data)
