@@ -14,9 +14,7 @@ from featuredb.stop_signals import on_stop_signals
 
 _BACKLOG = 128
 _LAST_PORT = 65_535
-CLIENT_GONE = (
-    499  # status of a request whose client has gone (nginx's custom); nobody reads it, but counts show it
-)
+CLIENT_GONE = 499  # a request whose client has gone (nginx's status): nobody reads it, but counts show it
 
 
 class ListenError(FeatureDbError):

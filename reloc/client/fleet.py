@@ -49,7 +49,7 @@ class Fleet:
         """`ask_all`: status of each server that answers within so many seconds."""
         self._ask_all = ask_all
         self._state = _State()
-        self._asking = threading.Lock()  # one thread makes the list anew
+        self._asking = threading.Lock()  # one thread makes the list anew; the others use the old one
         self._turns: dict[str, int] = {}
 
     def parts(self, prior: PriorRequest | None, timeout_s: float) -> list[str]:
@@ -67,6 +67,8 @@ class Fleet:
     def servers(self, part: str, timeout_s: float) -> list[str]:
         """Ids of the servers of a part, another one first each time; none where they are lost."""
         ids = self._ids(self._fresh(timeout_s).parts.get(part))
+        if not ids:  # another thread may be about to learn of others
+            ids = self._ids(self._fresh(timeout_s, wait=True).parts.get(part))
         if not ids:
             return []
         turn = self._turns[part] = self._turns.get(part, 0) + 1
@@ -86,11 +88,19 @@ class Fleet:
         lost = self._state.lost
         return [s.server_id if s.addressable else ANY for s in part.servers if s.server_id not in lost]
 
-    def _fresh(self, timeout_s: float) -> _State:
-        with self._asking:
-            if time.monotonic() >= self._state.until:
-                self._state = _next(self._state, self._ask_all(timeout_s))
+    def _fresh(self, timeout_s: float, *, wait: bool = False) -> _State:
+        """What is known now; `wait`: until another thread that asks has learnt it."""
+        state = self._state
+        if time.monotonic() < state.until and not wait:
+            return state
+        if not self._asking.acquire(blocking=wait or not state.parts):
+            return state
+        try:
+            if self._state is state and time.monotonic() >= state.until:
+                self._state = _next(state, self._ask_all(timeout_s))
             return self._state
+        finally:
+            self._asking.release()
 
 
 def _next(state: _State, answered: Sequence[StatusReply]) -> _State:
@@ -173,11 +183,15 @@ def _is_same(one: LocaliseReply, other: LocaliseReply) -> bool:
 
 
 def _ambiguous(best: LocaliseReply, rival: LocaliseReply) -> LocaliseReply:
-    same = ("features", "matches", "inliers", "snapshot", "timings_ms", "request_id", "contribution")
-    return LocaliseReply(
-        status="not_localised",
-        reason="AMBIGUOUS",
-        detail=f"another server's pose elsewhere has {rival.inliers} inliers, this one {best.inliers}",
-        confidence=0.0,
-        **{name: getattr(best, name) for name in same},
-    )
+    pose = ("position", "quaternion", "utm", "covariance", "accuracy", "camera", "height_datum", "in_map")
+    more = ("view_covariance", "residual_rms_px", "inlier_points", "runner_up", "exif_prior")
+    gone = dict.fromkeys((*pose, *more))
+    said = {
+        "status": "not_localised",
+        "reason": "AMBIGUOUS",
+        "detail": f"another server's pose elsewhere has {rival.inliers} inliers, this one {best.inliers}",
+        "confidence": 0.0,
+        "maps": (),
+        "lineage": (),
+    }
+    return LocaliseReply.model_validate({**dict(best), **gone, **said})
