@@ -183,6 +183,37 @@ def test_frames_that_contradict_the_map_are_refused(world: ScannedMap) -> None:
     assert adjustment.figures["own"]["own_px"] == pytest.approx(0.5, rel=0.2)
 
 
+def test_frames_that_lie_elsewhere_are_refused(world: ScannedMap) -> None:
+    """Each agrees with its own correspondences, 3.6 m off in a direction of its own: one map cannot have all."""
+    error = np.array([0.0, 0.0, 0.0, 3.0, 2.0, 0.0])
+    elsewhere = {}
+    for k in (0, 4, 8):
+        found, true = world.registered(k, error=error, correspondences=150), world.true_poses[k]
+        assert found.cam_from_local is not None
+        moved = (found.cam_from_local.inverse() @ true).act(found.points_local)
+        elsewhere[k] = replace(found, points_local=moved)
+    structure = project_structure(world.feature_map, elsewhere, world.cloud)
+    assert structure.accepted, structure.message  # a similarity cannot tell: maps bend
+    assert adjust_to_scan(world.feature_map, structure, elsewhere, world.cloud).reason == "CONTROL"
+
+
+def test_a_bent_map_is_straightened(world: ScannedMap) -> None:
+    """1.6 m at 20 m, as much as no similarity explains."""
+    points = world.feature_map.points_local(FRAME)
+    points[:, 2] += 0.004 * (points[:, 0] ** 2 + points[:, 1] ** 2)
+    utm = FRAME.utm_from_enu(points, world.feature_map.epsg)
+    bent = replace(world.feature_map, points=replace(world.feature_map.points, utm=utm))
+    registered = {4: world.registered(4, correspondences=150)}
+    structure = project_structure(bent, registered, world.cloud)
+    adjustment = adjust_to_scan(bent, structure, registered, world.cloud)
+    assert adjustment.accepted, adjustment.message
+    after = placed_map(bent, structure, world.cloud, adjustment)
+    seen = np.unique(after.observations.point_index)
+    assert np.median(np.linalg.norm(after.points_local(FRAME) - world.true_points, axis=1)[seen]) < 0.05
+    for image, pose in zip(after.images, world.true_poses, strict=True):
+        assert np.linalg.norm(image.cam_from_local.center - pose.center) < 0.15
+
+
 def test_coarse_correspondences_that_agree_are_no_contradiction(world: ScannedMap) -> None:
     """Pieces of a sparse scan's intensities: off by five pixels each, in a photo of 1,200."""
     rng = np.random.default_rng(5)

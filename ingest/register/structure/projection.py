@@ -26,7 +26,7 @@ from ingest.register.structure.depth_filter import SurfaceHits, surface_at
 from ingest.register.structure.similarity import Pairs, SimilarityFit, ransac_similarity, refine_similarity
 
 Registered = Mapping[int, FrameRegistration]  # accepted, in the local frame of the cloud, by image id
-StructureReason = Literal["TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
+StructureReason = Literal["TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "SCALE"]
 
 # A pair further off, as a share of its distance from the camera, is an outlier of RANSAC: reconstructions
 # bend by up to about a percent of the flying height.
@@ -38,7 +38,6 @@ _MIN_INLIER_SHARE = 0.3  # of the pairs; with fewer the frame or the map is wron
 # Second singular value of the inliers' spread over their distance from the camera; pairs closer to a line
 # leave the rotation about it open.
 _MIN_SPREAD_REL = 0.02
-_MAX_RESIDUAL_REL = 0.01  # root mean square of the inliers' residuals over their distance
 # Of the map against its present placement, beyond the sigmas of both. GPS that was accepted knows the scale
 # to a tenth or better.
 _MAX_SCALE_CHANGE = 0.05
@@ -98,7 +97,7 @@ def project_structure(
         "scale_sigma": float(np.sqrt(fit.covariance[0, 0])),
         "previous_scale_sigma": float(np.sqrt(feature_map.placement.covariance[0, 0])),
     }
-    reason, message = _gate_of_fit(fit, distances[near], figures)
+    reason, message = _gate_of_fit(fit, figures)
     placed = StructurePlacement(reason=reason, message=message, figures=figures)
     if reason is not None:
         return placed
@@ -126,18 +125,11 @@ def _gate_of_pairs(
     return None, "", figures
 
 
-def _gate_of_fit(
-    fit: SimilarityFit, distances: FloatArray, figures: dict[str, Any]
-) -> tuple[StructureReason | None, str]:
-    limit = max(_MIN_TOLERANCE_M, _MAX_RESIDUAL_REL * float(np.median(distances[fit.inliers])))
+def _gate_of_fit(fit: SimilarityFit, figures: dict[str, Any]) -> tuple[StructureReason | None, str]:
+    """How far the pairs miss each other is no question here: the adjustment behind it straightens the map."""
     if figures["inliers"] < _MIN_PAIRS:
         return "TOO_FEW_PAIRS", (
             f"{figures['inliers']} pairs remain after refinement, at least {_MIN_PAIRS} are needed"
-        )
-    if figures["residual_rms_m"] > limit:
-        return "RESIDUALS", (
-            f"the pairs miss each other by {figures['residual_rms_m']:.2f} m, at most {limit:.2f} m is "
-            "believed: the map is bent, or the frame is not where it seems"
         )
     change = abs(float(np.log(fit.target_from_source.scale)))
     sigma = float(np.hypot(figures["scale_sigma"], figures["previous_scale_sigma"]))
