@@ -184,7 +184,7 @@ def test_frames_that_contradict_the_map_are_refused(world: ScannedMap) -> None:
 
 
 def test_frames_that_lie_elsewhere_are_refused(world: ScannedMap) -> None:
-    """Each agrees with its own correspondences, 3.6 m off in a direction of its own: one map cannot have all."""
+    """Each agrees with its own correspondences, 3.6 m off its own way: one map cannot have all."""
     error = np.array([0.0, 0.0, 0.0, 3.0, 2.0, 0.0])
     elsewhere = {}
     for k in (0, 4, 8):
