@@ -205,19 +205,11 @@ def _judged(
         scores += [tags.log_likelihood(one.fit.local_from_own.act(plan.centers)[:, :2]) for one in there]
     first = int(scores.argmax())
     rate = float(chance[first])
-    kept = np.ones(len(unplaced.images), dtype=bool)
-    final = _best_around(plan, shape, there[first], rate)
-    sim = final.fit.local_from_own
-    for _ in range(_ROUNDS):
-        rows = _rows_seen(unplaced, plan, kept)
-        if len(rows) < _COARSE // 10:
-            break
-        final = _asked(shape, _fitted(plan, shape, sim, rows, _FINE_WIDTHS_M))
-        sim = final.fit.local_from_own
-        kept = _lie_there(unplaced, plan, shape, sim, rate)
+    final, kept = _settled(unplaced, plan, shape, there[first], rate)
     if kept.sum() < _LEAST_PHOTOS:
         few = f"{int(kept.sum())} of its photos lie on the scan"
         return GroundPlace(reason="TOO_FEW_FRAMES", message=few)
+    sim = final.fit.local_from_own
     high_m = _eyes_m(plan.centers[kept], shape, sim)
     if not _LOWEST_M < high_m < _HIGHEST_M:
         words = (
@@ -228,14 +220,8 @@ def _judged(
     there_m = (one.fit.local_from_own.act(plan.points[rows]) - sim.act(plan.points[rows]) for one in there)
     away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])
     log_nfa = _log_nfa(scores[first], scores[away > _ELSEWHERE_M]) - float(np.log10(tests))
-    others = [
-        one
-        for one, far in zip(there, away, strict=True)
-        if far > _APART_M and abs(np.log(one.fit.local_from_own.scale / sim.scale)) < _ALIKE
-    ]
-    best = sorted(others, key=lambda one: _score(one, rate))[-_RIVALS:]
-    rivals = (_rival_p(plan, shape, rows, sim, one.fit.local_from_own) for one in best)
-    rival = max(rivals, default=0.0)
+    apart = [one for one, far in zip(there, away, strict=True) if far > _APART_M]
+    rival = _best_rival(plan, shape, rows, sim, apart, rate)
     figures = {"photos": int(kept.sum()), "of": len(kept), "rate": rate, "log_nfa": log_nfa, "rival": rival}
     words = (
         f"{int(kept.sum())} of {len(kept)} photos lie on the scan's outlines: "
@@ -256,6 +242,23 @@ def _judged(
     if rival > _RIVAL_RATE:
         return replace(found, reason="AMBIGUOUS", message=f"{words}, and nearly as many at another place")
     return found
+
+
+def _settled(
+    unplaced: UnplacedMap, plan: StreetPlan, shape: ScanShape, best: _Tried, rate: float
+) -> tuple[_Tried, NDArray[np.bool_]]:
+    """The finest fit from the best place, and which photos lie there."""
+    kept = np.ones(len(unplaced.images), dtype=bool)
+    final = _best_around(plan, shape, best, rate)
+    sim = final.fit.local_from_own
+    for _ in range(_ROUNDS):
+        rows = _rows_seen(unplaced, plan, kept)
+        if len(rows) < _COARSE // 10:
+            break
+        final = _asked(shape, _fitted(plan, shape, sim, rows, _FINE_WIDTHS_M))
+        sim = final.fit.local_from_own
+        kept = _lie_there(unplaced, plan, shape, sim, rate)
+    return final, kept
 
 
 def _log_nfa(best: float, elsewhere: FloatArray) -> float:
@@ -324,6 +327,20 @@ def _lie_there(
             break
         stays = left
     return stays
+
+
+def _best_rival(
+    plan: StreetPlan,
+    shape: ScanShape,
+    rows: NDArray[np.int64],
+    sim: Sim3,
+    apart: Sequence[_Tried],
+    rate: float,
+) -> float:
+    """`_rival_p` of the best of the places apart from `sim` that are of about its size; 0 without any."""
+    sized = [one for one in apart if abs(np.log(one.fit.local_from_own.scale / sim.scale)) < _ALIKE]
+    best = sorted(sized, key=lambda one: _score(one, rate))[-_RIVALS:]
+    return max((_rival_p(plan, shape, rows, sim, one.fit.local_from_own) for one in best), default=0.0)
 
 
 def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:
