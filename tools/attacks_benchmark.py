@@ -8,12 +8,10 @@ as one that took the deadline.
 
 import itertools
 import multiprocessing
-import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from pathlib import Path
 
 import numpy as np
 import requests
@@ -22,13 +20,12 @@ from featuredb.store import Database
 from reloc.service.options import wire_name_of
 from tools.attacks import ATTACKS, Target
 from tools.figures import say, write_figures
-from tools.serve_process import beside, watched_memory
+from tools.serve_process import beside, memory_mib, watched_memory
 from tools.service_world import (
     ATTACKER,
     DEADLINE_S,
     Service,
     enlarged,
-    first_answers,
     honest_clients,
     photos_of,
     running_service,
@@ -45,17 +42,15 @@ def main() -> None:
     args = service_parser(__doc__).parse_args()
     database = Database.open(args.db)
     map_ids = enlarged(database, _POINTS)
-    photos = photos_of(args.photos, 6)
     measured: dict[str, dict[str, float]] = {}
-    with tempfile.TemporaryDirectory() as scratch, running_service(args.db, Path(scratch)) as service:
-        expected = first_answers(service, photos)
+    with running_service(args.db, photos_of(args.photos, 6)) as service:
         target = Target(
             config=service.config(ATTACKER),
             name=ATTACKER,
             port=service.port,
             gateway=int(service.gateway.endpoint.rsplit(":", 1)[1]),
             database=wire_name_of(str(args.db)),
-            photo=photos[0],
+            photo=service.photos[0],
             map_ids=map_ids,
             pid=service.server.process.pid,
         )
@@ -63,8 +58,8 @@ def main() -> None:
             with (
                 nullcontext() if name == "quiet" else _attacked(name, target),
                 watched_memory(service.server.process.pid) as memory,
-                honest_clients(service, photos, expected) as heard,
-                _web_client(service, photos) as http,
+                honest_clients(service) as heard,
+                _web_client(service) as http,
             ):
                 time.sleep(_SECONDS)
             time.sleep(_CALM_S)
@@ -75,7 +70,7 @@ def main() -> None:
                 "wrong": heard.wrong,
                 "http_p99_s": float(np.percentile(http, 99)),
                 "peak_mib": max(memory),
-                "after_mib": service.server.memory_mib(),
+                "after_mib": memory_mib(service.server.process.pid),
             }
             say(f"{name}: {measured[name]}")
     points = sum(one.points for one in database.snapshot().maps())
@@ -114,13 +109,13 @@ def _attacked(name: str, target: Target) -> Iterator[None]:
 
 
 @contextmanager
-def _web_client(service: Service, photos: Sequence[bytes]) -> Iterator[list[float]]:
+def _web_client(service: Service) -> Iterator[list[float]]:
     """Within the block a client asks over HTTP: seconds, of what has no answer the deadline."""
     heard: list[float] = []
     stop = threading.Event()
 
     def run() -> None:
-        for photo in itertools.cycle(photos):
+        for photo in itertools.cycle(service.photos):
             if stop.wait(1.0):
                 return
             start = time.monotonic()

@@ -47,7 +47,7 @@ from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import SURE_CONFIRMATION_LOG_NFA
 from tools.commands import cloud_of
-from tools.figures import off_pose, prior_off_by, say, study_parser, write_figures
+from tools.figures import few, off_pose, prior_off_by, say, study_parser, write_figures
 from tools.ortho_over_scan import (
     Floats,
     OrthoOverScan,
@@ -136,7 +136,7 @@ def _trials(place: OrthoOverScan, halves: Mapping[str, Part], folders: Sequence[
 
     for half, c, r in both:
         yield _Trial("window", half, c, r, cut(c, r))
-    photos = _foreign(folders)
+    photos = [folder / name for folder in folders for name in few(photo_names(folder), _EACH)]
     for path, (half, c, r) in zip(photos, cycle(both), strict=False):
         gray = decode_gray(path)
         scale = 2.2 * place.window / max(gray.shape)
@@ -170,15 +170,6 @@ def _spots(place: OrthoOverScan, part: Part) -> list[tuple[int, int]]:
         if place.shown[r : r + place.window, c : c + place.window].mean() > 0.9
     ]
     return spots[:: -(-len(spots) // _MOST)] if spots else []
-
-
-def _foreign(folders: Sequence[Path]) -> list[Path]:
-    """A few photos of each folder, spread over it."""
-    found = []
-    for folder in folders:
-        names = photo_names(folder)
-        found += [folder / name for name in names[:: max(1, len(names) // _EACH)][:_EACH]]
-    return found
 
 
 def _one(

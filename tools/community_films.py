@@ -12,7 +12,6 @@
 """
 
 import json
-import re
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,18 +21,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from featuredb.simworld.laser.airborne import AirborneScanOptions, scan_town
-from featuredb.simworld.scan_world import write_scan
-from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from ingest.report.page import REPORT_JSON
 from reloc.tracking.trajectory.files import read_trajectory_csv
 from reloc.tracking.trajectory.values import Trajectory
-from tools.commands import featuredb, newest_copy, once
-from tools.figures import inside, median, say, squared, study_parser, write_figures
+from tools.commands import featuredb, newest_copy
+from tools.figures import inside, say, spread, squared, study_parser, write_figures
 from tools.film_folder import HEIGHT, FilmsTruth, FrameTruth, Script, six_films, write_films
+from tools.paper import frame_of
 from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import axis_errors
+from tools.worlds.scan_world import make_scan_world
 
 Shot = tuple[str, int]  # name of a film's file, number of the piece
 
@@ -67,8 +65,7 @@ def main() -> None:
     figures = map_figures(maps, told, truth, six_films(args.seed)) | {"placed": 0}
     if of_place := {map_id: those for map_id, those in maps.items() if _of_place(those)}:
         database = newest_copy(made, work / "placed")
-        town, options = town_of(WorldOptions.short(args.seed)), AirborneScanOptions()
-        scan = once(inputs / "scan.laz", lambda file: write_scan(file, scan_town(town, options)))
+        scan = make_scan_world(args.inputs, args.seed).scan
         featuredb("lidar", "add", str(database), str(scan), "--quiet")
         biggest, keyframes = max(of_place.items(), key=lambda one: len(one[1]))
         photos, seen = keyframe_to_pick_in(keyframes, work / "stages" / "films")
@@ -104,8 +101,7 @@ def track_figures(tracks: Mapping[str, Trajectory], truth: FilmsTruth) -> dict[s
         "tracked_share": share,
         "inside_share": share * inside(squares, 0.95, 6) if squares else 0.0,
         "foreign_tracked": foreign,
-        "median_m": median(metres),
-        "largest_m": float(max(metres, default=np.nan)),
+        **spread(metres),
     }
 
 
@@ -165,13 +161,12 @@ def keyframe_to_pick_in(keyframes: Sequence[MapKeyframe], stills: Path) -> tuple
 
 
 def _keyframe(image: str, truth: FilmsTruth, reason: str = "") -> MapKeyframe:
-    """The film is a part of the image's path, and the last number of its name the frame."""
+    """The film is a part of the image's path, and its name the frame."""
     path = Path(image)
     named = [film for film in truth.films if Path(film).stem in path.parts[:-1]]
-    numbers = re.findall(r"\d+", path.stem)
-    if len(named) != 1 or not numbers:
+    if len(named) != 1:
         raise SystemExit(f"{image}: expected FILM/FRAME.jpg of {', '.join(truth.films)}")
-    frame = truth.films[named[0]][int(numbers[-1])]
+    frame = truth.films[named[0]][frame_of(image)]
     return MapKeyframe(image, (named[0], frame.piece), frame, reason)
 
 

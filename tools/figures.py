@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.stats import chi2
@@ -34,6 +34,8 @@ _SHARED: dict[str, dict[str, Any]] = {
     "scan": {"metavar": "LAZ"},
 }
 _LEVELS = (0.68, 0.95)
+T = TypeVar("T")
+Values = Sequence[float] | FloatArray
 
 
 class StudyParser(argparse.ArgumentParser):
@@ -81,21 +83,35 @@ def laid_on(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) ->
     return similarity_closed_form(*(np.array([of[name] for name in both]) for of in (mine, theirs)))
 
 
+def laid_poses(poses: Mapping[str, Rigid3], onto: Mapping[str, Rigid3]) -> dict[str, Rigid3]:
+    """Poses `cam_from_local`, moved by the similarity that takes their centres onto those of the same names;
+    none where these are too few."""
+    sim = laid_on(*({name: pose.center for name, pose in of.items()} for of in (poses, onto)))
+    return {name: sim.act_on_pose(pose) for name, pose in poses.items()} if sim else {}
+
+
 def laid_apart(mine: Mapping[str, FloatArray], theirs: Mapping[str, FloatArray]) -> list[float]:
     """Metres (n,) between places of the same names, once laid on each other; NaN where these are too few."""
     sim, both = laid_on(mine, theirs), sorted(mine.keys() & theirs.keys())
     return [float(np.linalg.norm(sim.act(mine[n]) - theirs[n])) if sim else float("nan") for n in both]
 
 
-def median(values: Sequence[float] | FloatArray) -> float:
+def few(values: Sequence[T], count: int) -> Sequence[T]:
+    """So many at the most, spread over all."""
+    return values[:: max(1, len(values) // count)][:count]
+
+
+def median(values: Values) -> float:
     """NaN of none."""
     return float(np.median(values)) if len(values) else float("nan")
 
 
-def spread(metres: Sequence[float], degrees: Sequence[float]) -> dict[str, float]:
-    """Medians and largest of errors of positions and orientations; NaN where there are none."""
+def spread(metres: Values, degrees: Values | None = None) -> dict[str, float]:
+    """Medians and largest of errors of positions, and of orientations; NaN where there are none."""
     figures: dict[str, float] = {}
-    for unit, errors in (("m", metres), ("deg", degrees)):
+    for unit, errors in {"m": metres, "deg": degrees}.items():
+        if errors is None:
+            continue
         figures |= {f"median_{unit}": median(errors), f"largest_{unit}": float(max(errors, default=np.nan))}
     return figures
 
@@ -118,20 +134,22 @@ def squared(error: FloatArray, covariance: FloatArray) -> float:
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def inside(squares: Sequence[float] | FloatArray, level: float, size: int = 3) -> float:
+def inside(squares: Values, level: float, size: int = 3) -> float:
     """Share of squared errors of `size` axes that lie inside the bound of that level; NaN of none."""
     return float(np.mean(np.asarray(squares) <= chi2.ppf(level, size))) if len(squares) else float("nan")
 
 
-def inside_figures(name: str, squares: Sequence[float] | FloatArray, size: int = 3) -> dict[str, float]:
+def inside_figures(name: str, squares: Values, size: int = 3) -> dict[str, float]:
     """Shares of squared errors inside 68 and 95 %, as NAME_68 and NAME_95."""
     return {f"{name}_{100 * level:.0f}": inside(squares, level, size) for level in _LEVELS}
 
 
-def bounds_figures(squares: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """Of squared errors of three axes by name: `inside_figures`, the worst; of all, those outside 99.9 %."""
+def bounds_figures(found: Sequence[Mapping[str, Sequence[float]]]) -> dict[str, float]:
+    """Of squared errors of three axes by name, of several maps: `inside_figures`, the worst; of all, those
+    outside 99.9 %."""
     figures: dict[str, float] = {"outside": 0}
-    for name, of in squares.items():
+    for name in found[0] if found else ():
+        of = [value for squares in found for value in squares[name]]
         figures |= inside_figures(name, of) | {f"{name}_worst": max(of, default=float("nan"))}
         figures["outside"] += sum(value > chi2.ppf(0.999, 3) for value in of)
     return figures

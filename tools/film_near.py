@@ -9,12 +9,10 @@ map is wrong where a camera is a metre off.
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from featuredb.store import Database
-from tools.commands import anchor, largest_map, newest_copy, once, with_scan
-from tools.figures import median, pose_errors, poses_in, study_parser, write_figures
-from tools.paper import frame_of, stills_of, unplaced_film
+from tools.commands import anchor, largest_map, make, newest_copy, once, with_scan
+from tools.figures import median, pose_errors, poses_in, spread, study_parser, write_figures
+from tools.paper import frame_of, stills_of
 from tools.track_evaluation import FRAMES, drawn_film
 from tools.unplaced_brighton import all_drawn, near_words
 from tools.worlds.film_world import FilmTruth
@@ -28,7 +26,7 @@ def main() -> None:
     inputs, work = args.inputs, args.work
     world = make_scan_world(inputs)
     film, truth = drawn_film("smooth", FRAMES, inputs)
-    made = once(work / "db", partial(unplaced_film, film))
+    made = once(work / "db", lambda path: make(path, "video", film, ("--no-telemetry",)))
     figures: dict[str, float] = {"draws": _DRAWS}
     for kind, scan in (("here", world.scan), ("elsewhere", world.other_scan)):
         scanned = with_scan(made, scan, work / kind)
@@ -48,7 +46,7 @@ def _draw(number: int, made: Path, work: Path, truth: FilmTruth) -> dict[str, fl
         return None
     poses = poses_in(truth.frame, Database.open(database).snapshot().load_map(map_id))
     off = pose_errors(poses, {name: truth.cam_from_local[frame_of(name)] for name in poses})[0]
-    return {"median_m": float(np.median(off)), "largest_m": float(off.max())}
+    return spread(off)
 
 
 if __name__ == "__main__":

@@ -20,9 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.arrays import FloatArray
+from featuredb.features.decode import decode_gray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.move import move_map
@@ -37,7 +36,7 @@ from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FrameRegistration
 from tools.anchor_simworld import camera_errors
 from tools.commands import cloud_of, largest_map, make, once
-from tools.figures import kept, median, prior_off_by, study_parser, write_figures
+from tools.figures import few, kept, off_pose, prior_off_by, spread, study_parser, write_figures
 from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 _TOWNS = tuple(range(301, 311))
@@ -73,8 +72,7 @@ def main() -> None:
             "alone_tried": _ALONE * len(towns),
             "placed": len(placed),
             "wrong": sum(metres > _WRONG_M for metres in placed),
-            "median_m": median(placed),
-            "largest_m": float(max(placed, default=np.nan)),
+            **spread(placed),
             "other_placed": sum(town["other"] for town in towns),
             "mirrored_placed": sum(town["mirrored"] for town in towns),
         },
@@ -86,7 +84,7 @@ def _found(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
     world = make_scan_world(inputs, seed)
     own = _cloud(world.scan, work)
     singles = []
-    for number, image in enumerate(_singles(world)):
+    for number, image in enumerate(few(world.world.truth.group("drone"), _PHOTOS)):
         true, found = _single(world, image, own, (seed, number))
         if found.cam_from_local is not None:
             off = float(np.linalg.norm(found.cam_from_local.center - true.center))
@@ -97,13 +95,9 @@ def _found(seed: int, inputs: Path, work: Path) -> dict[str, Any]:
 def _registered_elsewhere(seed: int, inputs: Path, work: Path) -> int:
     """How many of a town's photos, each from several priors, are registered on another town's scan."""
     world = make_scan_world(inputs, seed)
-    other, images = _cloud(world.other_scan, work), _singles(world)
+    other, images = _cloud(world.other_scan, work), few(world.world.truth.group("drone"), _PHOTOS)
     drawn = (_single(world, images[k % len(images)], other, (seed, 1000, k)) for k in range(_NEGATIVES))
     return sum(found.accepted for _, found in drawn)
-
-
-def _gray(path: Path) -> NDArray[np.uint8]:
-    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
 def _cloud(scan: Path, work: Path, *part: Any) -> PointCloud:
@@ -111,19 +105,14 @@ def _cloud(scan: Path, work: Path, *part: Any) -> PointCloud:
     return replace(cloud_of(scan, work / f"{scan.parent.name}-{scan.stem}", *part), rgb=None)
 
 
-def _singles(world: ScanWorld) -> list[TrueImage]:
-    named = world.world.truth.group("drone")
-    return named[:: max(1, len(named) // _PHOTOS)][:_PHOTOS]
-
-
 def _single(
     world: ScanWorld, image: TrueImage, cloud: PointCloud, seed: tuple[int, ...]
 ) -> tuple[Rigid3, FrameRegistration]:
     """The pose of a photo in a cloud, and its registration from a prior that is off."""
     true = image.cam_from_local @ cloud.frame.enu_from(world.world.truth.frame).inverse()
-    start = _moved(true.center, np.random.default_rng(seed)).act_on_pose(true)
+    start = off_pose(true, np.random.default_rng(seed), _OFF_M, _OFF_DEG)
     prior = prior_off_by(start, _OFF_M, _OFF_DEG)
-    return true, register_frame(_gray(world.world.folder / image.name), image.camera, prior, cloud)
+    return true, register_frame(decode_gray(world.world.folder / image.name), image.camera, prior, cloud)
 
 
 def _together(folder: Path, world: ScanWorld, work: Path, seed: int) -> dict[str, Any]:
@@ -141,7 +130,7 @@ def _together(folder: Path, world: ScanWorld, work: Path, seed: int) -> dict[str
     truth, made = open_world(folder).truth, largest_map(folder / "db")
 
     def read(image: MapImage) -> NDArray[np.uint8]:
-        return _gray(folder / "drone" / image.name)
+        return decode_gray(folder / "drone" / image.name)
 
     def mirrored(image: MapImage) -> NDArray[np.uint8]:
         return np.ascontiguousarray(read(image)[:, ::-1])
@@ -163,17 +152,10 @@ def _together(folder: Path, world: ScanWorld, work: Path, seed: int) -> dict[str
     }
 
 
-def _moved(middle: FloatArray, rng: np.random.Generator) -> Sim3:
-    """A turn about a place, and a shift."""
-    axis, way = (value / np.linalg.norm(value) for value in rng.normal(size=(2, 3)))
-    turn = so3_exp(np.radians(_OFF_DEG) * axis)
-    return Sim3(scale=1.0, rotation=turn, translation=_OFF_M * way).about(middle)
-
-
 def _misplaced(feature_map: FeatureMap, rng: np.random.Generator) -> FeatureMap:
-    """The map moved, with a placement that says how far."""
+    """The map moved, turned about its middle, with a placement that says how far."""
     middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
-    move = _moved(middle, rng)
+    move = Sim3.from_rigid3(off_pose(Rigid3.identity(), rng, _OFF_M, _OFF_DEG)).about(middle)
     sigmas = [0.01, *[np.radians(_OFF_DEG) * _AXIS] * 3, *[_OFF_M * _AXIS] * 3]
     covariance = Sim3.shift(move.act(middle)).carried(np.diag(np.square(sigmas)))
     return move_map(feature_map, move, covariance=covariance)

@@ -94,7 +94,9 @@ class Verdict(NamedTuple):
     holds: bool
 
 
-def world_told(doc: str | None, argv: Sequence[str] | None, world: type[W]) -> tuple[argparse.Namespace, W]:
+def world_told(
+    doc: str | None, world: type[W], argv: Sequence[str] | None = None
+) -> tuple[argparse.Namespace, W]:
     """What a program of a made world is told, its folder made, and the world; `doc`: of its module."""
     parser = study_parser(doc, "--work", "--seed")
     parser.set_defaults(seed=world().seed)
@@ -102,9 +104,100 @@ def world_told(doc: str | None, argv: Sequence[str] | None, world: type[W]) -> t
     return args, world(seed=args.seed)
 
 
-def surveyed(work: Path, options: W, plan: Callable[[W], list[PlannedPhoto]]) -> tuple[Album, Database]:
-    """The album of these options, made or finished unless it is complete, and a database of its survey."""
-    folder = work / "world"
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GrowthStudy:
+    """An album, and the database that grows by its photos."""
+
+    album: Album
+    database: Database
+
+    def anchor(self, survey: str) -> None:
+        """Ingest the survey of that folder of the album as an anchor, unless it is there."""
+        if any(m.name == survey for m in self.database.snapshot().maps()):
+            return
+        options = IngestOptions(gps_sigma_m=_SURVEY_SIGMA_M, making=_MAKING, name=survey, workers=_WORKERS)
+        report = ingest_photos(self.database, self.album.folder / survey, options)
+        placed = [m for m in report.maps if m.status != "refused"]
+        if len(placed) != 1:
+            raise SystemExit(f"{survey}: expected one anchored map, found {report.maps}")
+        say(f"{survey}: {placed[0].photos} photos, {placed[0].points} points")
+
+    def give(self, facts: Iterable[AlbumFact]) -> None:
+        """Contribute photos as clients do: the bytes, licence, and the table's position as the prior.
+
+        Each person of the album has a certificate of their own. None has a record: the survey's map, which
+        is an anchor, makes one for whoever photographs what it shows.
+        """
+        contributions = []
+        for fact in facts:
+            image = self.album.truth.images.get(fact.name)
+            size = (1, 1) if image is None else (image.camera.width, image.camera.height)
+            row = self.album.rows.get(fact.name, {})
+            request: dict[str, Any] = {}
+            if row.get("lat") is not None:
+                accuracy = row["accuracy"] or _UNSAID_M
+                request["prior"] = {"lat": row["lat"], "lon": row["lon"], "sigma_m": accuracy}
+            contributions.append(
+                Contribution(
+                    image=(self.album.folder / fact.name).read_bytes(),
+                    width=size[0],
+                    height=size[1],
+                    owner=fact.owner,
+                    credit=fact.owner,
+                    licence=fact.licence,
+                    received_at=datetime.now(UTC),
+                    request=request,
+                )
+            )
+        contribute(self.database, contributions)
+
+    def grown(self, gates: str = "gates") -> Counter[str]:
+        """Grow once: how many photos wait, by reason. What the gates say is recorded beside the database
+        (`tools.growth_gates`), under the name `gates`."""
+
+        def true_place(name: str) -> FloatArray | None:
+            image = self.album.truth.images.get(_album_name(self.album, name))
+            return None if image is None else image.cam_from_local.center
+
+        gates_file = Path(self.database.url).with_name(f"{gates}.jsonl")
+        with recorded(gates_file, self.album.truth.frame, true_place):
+            report = grow_candidates(self.database, GROWING)
+        for line in report.as_text().splitlines():
+            say(line[:300])
+        return Counter(p.reason_code for p in report.photos if p.reason_code)
+
+    def registered(self) -> list[Registered]:
+        """All photos of the album in living maps, anchors included, with their errors."""
+        found: list[Registered] = []
+        snapshot = self.database.snapshot()
+        for summary in snapshot.maps():
+            feature_map = snapshot.load_map(summary.map_id)
+            bound_m = drift_m(feature_map.placement.covariance, places_of(feature_map))
+            for name, pose in poses_in(self.album.truth.frame, feature_map).items():
+                fact = self.album.facts[_album_name(self.album, name, feature_map.name)]
+                true = self.album.truth.images.get(fact.name)
+                offset = None if true is None else pose.center - true.cam_from_local.center
+                found.append(
+                    Registered(
+                        fact=fact,
+                        map_id=summary.map_id,
+                        status=summary.status,
+                        generation=summary.generation,
+                        offset_m=offset,
+                        drift_m=summary.drift_m,
+                        bound_m=bound_m,
+                    )
+                )
+        return found
+
+
+def surveyed(
+    doc: str | None, world: type[W], plan: Callable[[W], list[PlannedPhoto]]
+) -> tuple[argparse.Namespace, W, GrowthStudy]:
+    """What `world_told` says, and a study of the world's album, made or finished unless it is complete, and
+    a database of its survey; `plan` gives the album's photos."""
+    args, options = world_told(doc, world)
+    folder = args.work / "world"
 
     def progress(done: int, total: int) -> None:
         if done % 100 == 0 or done == total:
@@ -114,51 +207,9 @@ def surveyed(work: Path, options: W, plan: Callable[[W], list[PlannedPhoto]]) ->
     lines = (folder / TABLE_FILE).read_text(encoding="utf-8").splitlines()
     rows = {row["path"]: row for row in map(json.loads, lines)}
     album = Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
-    return album, anchored(work / "db", album, "survey")
-
-
-def anchored(path: Path, album: Album, survey: str) -> Database:
-    """The database in `path`, with the survey of that folder of the album as an anchor."""
-    database = Database.create(path)
-    if any(m.name == survey for m in database.snapshot().maps()):
-        return database
-    options = IngestOptions(gps_sigma_m=_SURVEY_SIGMA_M, making=_MAKING, name=survey, workers=_WORKERS)
-    report = ingest_photos(database, album.folder / survey, options)
-    placed = [m for m in report.maps if m.status != "refused"]
-    if len(placed) != 1:
-        raise SystemExit(f"{survey}: expected one anchored map, found {report.maps}")
-    say(f"{survey}: {placed[0].photos} photos, {placed[0].points} points")
-    return database
-
-
-def give(database: Database, album: Album, facts: Iterable[AlbumFact]) -> None:
-    """Contribute photos as clients do: the bytes, licence, and the table's position as the prior.
-
-    Each person of the album has a certificate of their own. None has a record: the survey's map, which is an
-    anchor, makes one for whoever photographs what it shows.
-    """
-    contributions = []
-    for fact in facts:
-        image = album.truth.images.get(fact.name)
-        size = (1, 1) if image is None else (image.camera.width, image.camera.height)
-        row = album.rows.get(fact.name, {})
-        request: dict[str, Any] = {}
-        if row.get("lat") is not None:
-            accuracy = row["accuracy"] or _UNSAID_M
-            request["prior"] = {"lat": row["lat"], "lon": row["lon"], "sigma_m": accuracy}
-        contributions.append(
-            Contribution(
-                image=(album.folder / fact.name).read_bytes(),
-                width=size[0],
-                height=size[1],
-                owner=fact.owner,
-                credit=fact.owner,
-                licence=fact.licence,
-                received_at=datetime.now(UTC),
-                request=request,
-            )
-        )
-    contribute(database, contributions)
+    study = GrowthStudy(album=album, database=Database.create(args.work / "db"))
+    study.anchor("survey")
+    return args, options, study
 
 
 @lru_cache(maxsize=64)
@@ -168,31 +219,6 @@ def _candidate_names(folder: Path) -> dict[str, str]:
         candidate_id_of(path.read_bytes()): path.relative_to(folder).as_posix()
         for path in sorted(folder.rglob("*.jpg"))
     }
-
-
-def registered(database: Database, album: Album) -> list[Registered]:
-    """All photos of the album in living maps, anchors included, with their errors."""
-    found: list[Registered] = []
-    snapshot = database.snapshot()
-    for summary in snapshot.maps():
-        feature_map = snapshot.load_map(summary.map_id)
-        bound_m = drift_m(feature_map.placement.covariance, places_of(feature_map))
-        for name, pose in poses_in(album.truth.frame, feature_map).items():
-            fact = album.facts[_album_name(album, name, feature_map.name)]
-            true = album.truth.images.get(fact.name)
-            offset = None if true is None else pose.center - true.cam_from_local.center
-            found.append(
-                Registered(
-                    fact=fact,
-                    map_id=summary.map_id,
-                    status=summary.status,
-                    generation=summary.generation,
-                    offset_m=offset,
-                    drift_m=summary.drift_m,
-                    bound_m=bound_m,
-                )
-            )
-    return found
 
 
 def _album_name(album: Album, name: str, folder: str = "") -> str:
@@ -211,8 +237,8 @@ def answer_of(localiser: Localiser, photo: Path) -> LocaliseResult:
     return localiser.localise(gray, localise_request(LocaliseWireRequest(), data, header), header.size)
 
 
-def conclude(path: Path | None, verdicts: Sequence[Verdict], lost: int) -> int:
-    """Print what was measured, and write it to a path; 0 if everything holds.
+def conclude(path: Path | None, verdicts: Sequence[Verdict], lost: int) -> None:
+    """Print what was measured, and write it to a path.
 
     Args:
         lost: photos that a step lost by an exception that it did not foresee, not by a reason.
@@ -222,18 +248,3 @@ def conclude(path: Path | None, verdicts: Sequence[Verdict], lost: int) -> int:
     say(f"does not hold: {', '.join(failed) or 'nothing'}")
     summary = "; ".join(f"{v.name}: {v.text}" for v in verdicts)
     write_figures(path, {"failed": len(failed), "summary": summary})
-    return 1 if failed else 0
-
-
-def grown(database: Database, out: Path, album: Album, gates: str = "gates") -> Counter[str]:
-    """Grow once, with what the gates say recorded (`tools.growth_gates`): how many photos wait, by reason."""
-
-    def true_place(name: str) -> FloatArray | None:
-        image = album.truth.images.get(_album_name(album, name))
-        return None if image is None else image.cam_from_local.center
-
-    with recorded(out / f"{gates}.jsonl", album.truth.frame, true_place):
-        report = grow_candidates(database, GROWING)
-    for line in report.as_text().splitlines():
-        say(line[:300])
-    return Counter(p.reason_code for p in report.photos if p.reason_code)

@@ -6,21 +6,10 @@ with the accuracy of its receiver. All other photos are contributed and grown at
 most of the photos, as on photo sites.
 """
 
-import sys
 from collections.abc import Sequence
 
 from tools.figures import median
-from tools.growth_common import (
-    Album,
-    Registered,
-    Verdict,
-    conclude,
-    give,
-    grown,
-    registered,
-    surveyed,
-    world_told,
-)
+from tools.growth_common import Album, Registered, Verdict, conclude, surveyed
 from tools.worlds.community import CommunityOptions, community_album
 
 _OWN = ("street", "drone")
@@ -28,12 +17,11 @@ _FOREIGN = ("other_town", "indoor", "portrait")
 _SHARE, _MEDIAN_M = 0.70, 0.30
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args, world = world_told(__doc__, argv, CommunityOptions)
-    album, database = surveyed(args.work, world, community_album)
-    give(database, album, album.of(*_OWN, *_FOREIGN, "copy"))
-    waiting = grown(database, args.work, album)
-    return conclude(args.json, judge(album, registered(database, album)), waiting["FAILED"])
+def main() -> None:
+    args, _, study = surveyed(__doc__, CommunityOptions, community_album)
+    study.give(study.album.of(*_OWN, *_FOREIGN, "copy"))
+    waiting = study.grown()
+    conclude(args.json, judge(study.album, study.registered()), waiting["FAILED"])
 
 
 def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
@@ -69,4 +57,4 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -16,7 +16,6 @@ before, while it is in service, and after `retire`: bit for bit, but for the num
 """
 
 import json
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -36,17 +35,7 @@ from featuredb.store.canaries import KnownPose, add_canary
 from ingest.growth.trust.promotion import promote_by_hand
 from reloc.localiser import Localiser
 from tools.commands import newest_copy
-from tools.growth_common import (
-    Album,
-    Verdict,
-    answer_of,
-    conclude,
-    give,
-    grown,
-    registered,
-    surveyed,
-    world_told,
-)
+from tools.growth_common import Album, GrowthStudy, Verdict, answer_of, conclude, surveyed
 from tools.worlds.poison_world import POISONS, PoisonOptions, poison_album
 
 _OFF_M, _OFF_SHARE = 1.0, 0.02
@@ -73,19 +62,25 @@ class PoisonOutcome:
     failed: int = 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args, world = world_told(__doc__, argv, PoisonOptions)
-    album, base = surveyed(args.work, world, poison_album)
-    grow_honest(base, album)
-    clean = max(off_shares(base, album, world).values(), default=0.0)
-    outcome = try_poison(args.work, base, album, world)
-    forced = Database.open(newest_copy(args.work / "db", args.work / "db-forced"))
-    fabricated = force_and_retire(forced, album, [moved_copy(forced)])
-    return conclude(args.json, judge(outcome, clean, fabricated), outcome.failed)
+def main() -> None:
+    args, world, honest = surveyed(__doc__, PoisonOptions, poison_album)
+    grow_honest(honest)
+    clean = max(off_shares(honest, world).values(), default=0.0)
+    outcome = try_poison(copied(honest, "db-poisoned"), world)
+    forced = copied(honest, "db-forced")
+    fabricated = force_and_retire(forced, [moved_copy(forced.database)])
+    conclude(args.json, judge(outcome, clean, fabricated), outcome.failed)
 
 
-def grow_honest(database: Database, album: Album) -> None:
+def copied(study: GrowthStudy, name: str) -> GrowthStudy:
+    """The study on a copy of its database, of that name."""
+    source = Path(study.database.url)
+    return replace(study, database=Database.open(newest_copy(source, source.with_name(name))))
+
+
+def grow_honest(study: GrowthStudy) -> None:
     """Honest photos and canaries, before any poison."""
+    database, album = study.database, study.album
     if any(m.method == "map" for m in database.snapshot().maps()):
         return
     for fact in album.of("canary"):
@@ -100,24 +95,23 @@ def grow_honest(database: Database, album: Album) -> None:
             tolerance_deg=_CANARY_DEG,
         )
         add_canary(database, fact.photo_id, (album.folder / fact.name).read_bytes(), pose, origin="person")
-    give(database, album, album.of("honest"))
-    grown(database, Path(database.url).parent, album)
+    study.give(album.of("honest"))
+    study.grown()
 
 
-def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) -> PoisonOutcome:
+def try_poison(study: GrowthStudy, world: PoisonOptions) -> PoisonOutcome:
     """All poison on a copy of the honest database."""
-    database = Database.open(newest_copy(Path(base.url), out / "db-poisoned"))
-    sent = album.of(*POISONS)
+    sent = study.album.of(*POISONS)
     failed = 0
-    for arrived in (sent, album.of("late")):
-        give(database, album, arrived)
-        failed += grown(database, out, album, "gates-poisoned")["FAILED"]
-    found = registered(database, album)
+    for arrived in (sent, study.album.of("late")):
+        study.give(arrived)
+        failed += study.grown("gates-poisoned")["FAILED"]
+    found = study.registered()
     active = [r for r in found if r.status == "active" and r.generation > 0]
     poisoned = {r.map_id for r in active if r.fact.kind in POISONS}
-    shares = off_shares(database, album, world)
+    shares = off_shares(study, world)
     held = {r.map_id for r in found if r.status == "quarantined" and (r.fact.kind in POISONS or r.wrong)}
-    forced = force_and_retire(database, album, sorted(held))
+    forced = force_and_retire(study, sorted(held))
     return PoisonOutcome(
         sent=len(sent),
         active=sum(r.fact.kind in POISONS for r in active),
@@ -129,14 +123,14 @@ def try_poison(out: Path, base: Database, album: Album, world: PoisonOptions) ->
     )
 
 
-def off_shares(database: Database, album: Album, world: PoisonOptions) -> dict[str, float]:
+def off_shares(study: GrowthStudy, world: PoisonOptions) -> dict[str, float]:
     """For each active grown map, the share of its points' observations off what truly is there."""
-    shares, found = {}, registered(database, album)
-    for summary in database.snapshot().maps():
+    shares, found, snapshot = {}, study.registered(), study.database.snapshot()
+    for summary in snapshot.maps():
         if summary.status == "active" and summary.method == "map":
             names = [r.fact.name for r in found if r.map_id == summary.map_id]
-            feature_map = database.snapshot().load_map(summary.map_id)
-            shares[summary.map_id] = _off_share(feature_map, album, world, names)
+            feature_map = snapshot.load_map(summary.map_id)
+            shares[summary.map_id] = _off_share(feature_map, study.album, world, names)
     return shares
 
 
@@ -164,15 +158,15 @@ def _off_share(feature_map: FeatureMap, album: Album, world: PoisonOptions, name
     return off / max(total, 1)
 
 
-def force_and_retire(database: Database, album: Album, held: Sequence[str]) -> dict[str, Any]:
+def force_and_retire(study: GrowthStudy, held: Sequence[str]) -> dict[str, Any]:
     """Force maps in by hand and take them out again; whether answers changed, and whether they came back."""
-    before = answers(database, album)
+    database, before = study.database, answers(study)
     done = [one for one in held if promote_by_hand(database, one, "forced for the test", force=True).promoted]
-    during = answers(database, album) if done else before
+    during = answers(study) if done else before
     for map_id in done:
         if database.snapshot().get(map_id).status != "retired":
             database.retire(map_id, "it is wrong")
-    after = answers(database, album) if done else before
+    after = answers(study) if done else before
     return {"forced": len(done), "changed": during != before, "restored": after == before}
 
 
@@ -188,9 +182,9 @@ def moved_copy(database: Database) -> str:
     return wrong.map_id
 
 
-def answers(database: Database, album: Album) -> dict[str, str]:
+def answers(study: GrowthStudy) -> dict[str, str]:
     """Every figure of the answers to canaries and honest photos, without times and the snapshot's number."""
-    localiser = Localiser.open(database)
+    localiser, album = Localiser.open(study.database), study.album
     found = {}
     for fact in [*album.of("canary"), *album.of("honest")[:20]]:
         result = answer_of(localiser, album.folder / fact.name)
@@ -224,4 +218,4 @@ def judge(o: PoisonOutcome, clean: float, fabricated: dict[str, Any]) -> list[Ve
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

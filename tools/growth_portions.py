@@ -39,7 +39,7 @@ from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from tools.figures import laid_apart, median, poses_in, say, study_parser, write_figures
+from tools.figures import laid_apart, poses_in, say, spread, study_parser, write_figures
 from tools.growth_gates import recorded
 
 _PORTIONS = 3
@@ -217,8 +217,7 @@ def _judged(state: State) -> dict[str, float]:
         "joint": len(reference),
         "grown": len(apart),
         "missing": len(reference.keys() - state.poses.keys()),
-        "median_m": median(apart),
-        "largest_m": float(np.max(apart, initial=0)),
+        **spread(apart),
     }
 
 

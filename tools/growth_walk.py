@@ -6,33 +6,18 @@ ask where they were taken, and the new maps are compared with the truth. When ev
 survey at the far end is ingested and growth runs again.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2
 
-from featuredb.store import Database
 from ingest.growth.values import DRIFT_BUDGET_M
 from reloc.localiser import Localiser
 from tools.figures import say, squared
-from tools.growth_common import (
-    WRONG_M,
-    Album,
-    Registered,
-    Verdict,
-    anchored,
-    answer_of,
-    conclude,
-    give,
-    grown,
-    registered,
-    surveyed,
-    world_told,
-)
+from tools.growth_common import Album, GrowthStudy, Registered, Verdict, answer_of, conclude, surveyed
+from tools.growth_gates import WRONG_M
 from tools.worlds.album import AlbumFact
 from tools.worlds.walk_world import WalkOptions, plan_walk
 
@@ -70,23 +55,22 @@ class Step:
     probes: tuple[Probe, ...]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    args, world = world_told(__doc__, argv, WalkOptions)
-    album, database = surveyed(args.work, world, plan_walk)
+def main() -> None:
+    args, world, study = surveyed(__doc__, WalkOptions, plan_walk)
     steps = []
-    for batch in sorted({f.batch for f in album.of("walk")}):
-        give(database, album, album.of("walk", batch=batch))
-        steps.append(measure(database, album, batch))
+    for batch in sorted({f.batch for f in study.album.of("walk")}):
+        study.give(study.album.of("walk", batch=batch))
+        steps.append(measure(study, batch))
         say(f"{steps[-1]}")
-    end, commits = second_anchor(database, album)
-    return conclude(args.json, judge(steps, end, commits, world), sum(s.failed for s in (*steps, end)))
+    end, commits = second_anchor(study)
+    conclude(args.json, judge(steps, end, commits, world), sum(s.failed for s in (*steps, end)))
 
 
-def measure(database: Database, album: Album, batch: int) -> Step:
+def measure(study: GrowthStudy, batch: int) -> Step:
     """Grow once: maps and probes of all steps up to this one against the truth."""
-    waiting = grown(database, Path(database.url).parent, album)
+    waiting, album = study.grown(), study.album
     edge = max(_along(album, f) for f in album.of("survey"))
-    active = [r for r in registered(database, album) if r.generation > 0 and r.status == "active"]
+    active = [r for r in study.registered() if r.generation > 0 and r.status == "active"]
     return Step(
         step=batch,
         reach_m=max((_along(album, r.fact) - edge for r in active), default=0.0),
@@ -94,7 +78,7 @@ def measure(database: Database, album: Album, batch: int) -> Step:
         ratio=worst_ratio(active),
         stopped=waiting["DRIFT_BUDGET"],
         failed=waiting["FAILED"],
-        probes=tuple(ask_probes(database, album, batch)),
+        probes=tuple(ask_probes(study, batch)),
     )
 
 
@@ -108,9 +92,9 @@ def worst_ratio(found: Sequence[Registered]) -> float:
     return max(ratios)
 
 
-def ask_probes(database: Database, album: Album, upto: int) -> list[Probe]:
+def ask_probes(study: GrowthStudy, upto: int) -> list[Probe]:
     """Ask for every probe of the steps so far."""
-    localiser = Localiser.open(database)
+    localiser, album = Localiser.open(study.database), study.album
     probes = []
     for fact in (fact for fact in album.of("probe") if fact.batch <= upto):
         pose = answer_of(localiser, album.folder / fact.name).pose
@@ -123,11 +107,11 @@ def ask_probes(database: Database, album: Album, upto: int) -> list[Probe]:
     return probes
 
 
-def second_anchor(database: Database, album: Album) -> tuple[Step, int]:
+def second_anchor(study: GrowthStudy) -> tuple[Step, int]:
     """Ingest the far survey, grow, measure; also in how many commits the maps that were there moved."""
-    version = database.poll_version()
-    anchored(Path(database.url), album, "survey_far")
-    end = measure(database, album, max(f.batch for f in album.of("walk")))
+    database, version = study.database, study.database.poll_version()
+    study.anchor("survey_far")
+    end = measure(study, max(f.batch for f in study.album.of("walk")))
     snapshots = (database.snapshot(v) for v in range(version, database.poll_version() + 1))
     first, *later = ({m.map_id: m.write_id for m in snapshot.maps()} for snapshot in snapshots)
     moved = [
@@ -198,4 +182,4 @@ def _along(album: Album, fact: AlbumFact) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -6,13 +6,13 @@ and all its children (what they share counts once) is sampled ten times a second
 """
 
 import shutil
+from datetime import date
 from pathlib import Path
 
-import laspy
 import numpy as np
-from laspy.vlrs.known import WktCoordinateSystemVlr
-from pyproj import CRS
 
+from featuredb.geo.crs.wkt import utm_wkt
+from featuredb.lidar.formats.las_stream import LasStream
 from tools.commands import cost_of, once
 from tools.figures import study_parser, write_figures
 
@@ -21,29 +21,24 @@ EPSG = 32632
 WEST, SOUTH = 560_000.0, 5_930_000.0
 SAMPLE_S = 0.1
 _PER_M2 = 20.0  # points per square metre
+_COLOUR = np.array([1.0, 0.92, 0.8])  # red, green, blue of an intensity
+_DAY = date(2025, 4, 2)
 
 
 def make_scan(path: Path, points: int) -> None:
     """Write a scan of a square, in strips from west to east."""
     rng = np.random.default_rng(1)
     side = float(np.sqrt(points / _PER_M2))
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.001), np.array([WEST, SOUTH, 0.0])
-    header.vlrs.append(WktCoordinateSystemVlr(CRS.from_epsg(EPSG).to_wkt("WKT1_GDAL")))
-    header.global_encoding.wkt = True
-    with laspy.open(path, mode="w", header=header) as writer:
+    offset = np.array([WEST, SOUTH, 0.0])
+    with LasStream(path, utm_wkt(EPSG, "ellipsoidal"), offset=offset, step_m=0.001, day=_DAY) as stream:
         for start in range(0, points, CHUNK):
             n = min(CHUNK, points - start)
             east = side * (start + n * rng.random(n)) / points
             north = side * rng.random(n)
             height, label, value = _surface(rng, east, north)
-            record = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-            record.x, record.y, record.z = WEST + east, SOUTH + north, height
-            record.classification = label
-            record.intensity = value
-            for name, gain in (("red", 250), ("green", 230), ("blue", 200)):
-                setattr(record, name, (value.astype(np.uint32) * gain % 65536).astype(np.uint16))
-            writer.write_points(record)
+            utm = offset + np.column_stack([east, north, height])
+            rgb = (value[:, None] * _COLOUR).astype(np.uint8)
+            stream.write(utm, {"classification": label, "intensity": value}, rgb)
 
 
 def _surface(

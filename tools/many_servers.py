@@ -45,18 +45,8 @@ class _Slow:
         self, gray: NDArray[np.uint8], request: LocaliseRequest, size: tuple[int, int]
     ) -> LocaliseResult:
         time.sleep(_TAKES_S)
-        return LocaliseResult(
-            reason="NO_COVERAGE",
-            detail="",
-            pose=None,
-            confidence=0.0,
-            features=0,
-            matches=0,
-            inliers=0,
-            runner_up=None,
-            snapshot=self.snapshot,
-            timings_ms={},
-        )
+        nothing = {"features": 0, "matches": 0, "inliers": 0}
+        return LocaliseResult(reason="NO_COVERAGE", detail="", snapshot=self.snapshot, **nothing)
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, first_map, make, newest_copy
-from tools.figures import bounds_figures, median, pose_errors, poses_in, write_figures
+from tools.figures import bounds_figures, pose_errors, poses_in, spread, write_figures
 from tools.laser_truth import camera_squares
 from tools.scan_poses import scan_parser, scan_truth
 
@@ -35,20 +35,17 @@ def main() -> None:
     make(args.work / "db", "photos", args.photos)
     scan = laspy.read(args.scan)
     errors: list[float] = []
-    squares: dict[str, list[float]] = {"orientation": [], "position": []}
-    placed = 0
+    squares = []
     for name, part in _PARTS.items():
         database = newest_copy(args.work / "db", args.work / name)
         featuredb("lidar", "add", str(database), str(_cut(scan, part, args.work / f"{name}.laz")), "--quiet")
         map_id = first_map(Database.open(database)).map_id
         if anchor(database, map_id, args.photos, args.work / "anchor"):
-            feature_map, placed = first_map(Database.open(database)), placed + 1
+            feature_map = first_map(Database.open(database))
             errors += pose_errors(poses_in(truth.frame, feature_map), truth.poses)[0].tolist()
-            for kind, of in camera_squares(feature_map, truth.frame, truth.poses).items():
-                squares[kind] += of
-    counts = {"parts": len(_PARTS), "placed": placed, "cameras": len(errors)}
-    spread = {"median_m": median(errors), "largest_m": max(errors, default=float("nan"))}
-    write_figures(args.json, counts | spread | bounds_figures(squares))
+            squares.append(camera_squares(feature_map, truth.frame, truth.poses))
+    counts = {"parts": len(_PARTS), "placed": len(squares), "cameras": len(errors)}
+    write_figures(args.json, counts | spread(errors) | bounds_figures(squares))
 
 
 def _cut(scan: laspy.LasData, part: tuple[float, float, float, float], path: Path) -> Path:
@@ -56,9 +53,7 @@ def _cut(scan: laspy.LasData, part: tuple[float, float, float, float], path: Pat
     xy = np.asarray(scan.xyz)[:, :2]
     share = (xy - xy.min(axis=0)) / np.ptp(xy, axis=0)
     inside: NDArray[np.bool_] = ((share >= part[::2]) & (share <= part[1::2])).all(axis=1)
-    made = laspy.LasData(scan.header)
-    made.points = scan.points[inside]
-    made.write(path)
+    scan[inside].write(path)
     return path
 
 

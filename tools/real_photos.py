@@ -34,7 +34,7 @@ from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
 from reloc.wire.query import CameraRequest
 from tools.commands import make
-from tools.figures import laid_on, poses_in, say, spread, study_parser, write_figures
+from tools.figures import laid_poses, poses_in, say, spread, study_parser, write_figures
 from tools.photo_files import copied, photo_names
 
 _EVERY = 5  # without --held-out, one photo in so many is held out
@@ -73,9 +73,7 @@ def main() -> None:
 def as_film(photos: Path, names: Sequence[str], work: Path, whole: FeatureMap) -> dict[str, float]:
     """All photos tracked by the map in `work`/part, against the map of all."""
     part = reference(work / "part")
-    theirs, mine = poses_in(part.frame, whole), poses_in(part.frame, part)
-    sim = laid_on(*({name: pose.center for name, pose in of.items()} for of in (theirs, mine)))
-    moved = {name: sim.act_on_pose(pose) for name, pose in theirs.items()}
+    moved = laid_poses(poses_in(part.frame, whole), poses_in(part.frame, part))
     frames = copied(photos, names, work / "frames", strip=False)
     lines = ["file,time_s", *(f"{name},{i}" for i, name in enumerate(names))]
     (frames / "timestamps.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")

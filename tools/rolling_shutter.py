@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.camera.photograph import Device, Shot, exif_of, jpeg_bytes
 from featuredb.simworld.world import WorldOptions, in_order, town_of
@@ -26,10 +25,10 @@ from tools.laser_truth import camera_squares
 from tools.photo_files import with_place
 from tools.worlds.film_world import (
     FilmOptions,
-    FlightPath,
     FlightStyle,
     PathOptions,
     film_frame,
+    flight_path,
     wandering_errors,
 )
 
@@ -68,7 +67,7 @@ def film_options(style: FlightStyle, seed: int) -> FilmOptions:
     """A film with a frame a second."""
     return FilmOptions(
         world=WorldOptions.short(1),
-        path=PathOptions(seed=seed, style=style, half_extent_m=(32.0, 26.0), duration_s=float(_PHOTOS)),
+        path=PathOptions(seed=seed, style=style, half_extent_m=(32.0, 26.0)),
         frames=_PHOTOS,
         rate_hz=1.0,
         width=960,
@@ -95,16 +94,11 @@ def _jpeg(film: FilmOptions, frame: int) -> bytes:
     shot = Shot(
         name=f"{frame:04d}.jpg",
         device=device,
-        cam_from_local=pose_at(film, time_s),
+        cam_from_local=flight_path(film).pose(time_s),
         time=_START + timedelta(seconds=time_s),
         seed=frame,
     )
     return jpeg_bytes(film_frame(film, frame), exif_of(shot, None), 92)
-
-
-def pose_at(film: FilmOptions, time_s: float) -> Rigid3:
-    """The true pose, in the town's frame."""
-    return FlightPath(town_of(film.world), film.path).pose(time_s)
 
 
 def tagged(film: FilmOptions, pictures: Path, rtk: bool, folder: Path) -> Path:
@@ -113,7 +107,7 @@ def tagged(film: FilmOptions, pictures: Path, rtk: bool, folder: Path) -> Path:
     frame, rng = town_of(film.world).frame, np.random.default_rng((film.path.seed, 74))
     sigma, late_s, keep = (_RTK_M, 0.0, 0.0) if rtk else (_RECEIVER_M, _LATE_S, np.exp(-1.0 / 20.0))
     for k, error in enumerate(wandering_errors(rng, sigma, keep, film.frames)):
-        place = pose_at(film, film.time_s(k) - late_s).center + error
+        place = flight_path(film).pose(film.time_s(k) - late_s).center + error
         picture = pictures / f"{k:04d}.jpg"
         told = with_place(picture.read_bytes(), frame, place, 1.51 * _RTK_M if rtk else None)
         (folder / picture.name).write_bytes(told)
@@ -123,7 +117,7 @@ def tagged(film: FilmOptions, pictures: Path, rtk: bool, folder: Path) -> Path:
 def normalised(film: FilmOptions, feature_map: FeatureMap) -> tuple[float, float]:
     """Squared errors of position and orientation by their covariance, at the median camera."""
     frames = {image.name: int(Path(image.name).stem) for image in feature_map.images}
-    true = {name: pose_at(film, film.time_s(frame)) for name, frame in frames.items()}
+    true = {name: flight_path(film).pose(film.time_s(frame)) for name, frame in frames.items()}
     squares = camera_squares(feature_map, town_of(film.world).frame, true)
     return float(np.median(squares["position"])), float(np.median(squares["orientation"]))
 

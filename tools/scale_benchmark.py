@@ -40,7 +40,7 @@ from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from tools.commands import first_map
-from tools.figures import study_parser, write_figures
+from tools.figures import few, study_parser, write_figures
 from tools.service_world import cell_order, copied_map
 
 _HELD_OUT = 4  # photos of each map
@@ -144,8 +144,7 @@ def city(path: Path, sources: Sequence[MapSource], points: int) -> list[Query]:
             features = replace(photo, descriptors=photo.descriptors[:, cell_order(copies)])
             queries.append(Query(features, camera, prior, geodetic))
         copies += 1
-    every = max(1, len(queries) // _ASKED)
-    return queries[::every][:_ASKED]
+    return list(few(queries, _ASKED))
 
 
 def first_start(path: Path, query: Query) -> float:

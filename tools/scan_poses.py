@@ -31,7 +31,6 @@ from tools.scan_to_photo import (
     correspond,
     first_pose,
     nadir_raster,
-    raster_features,
     read_scan,
 )
 
@@ -84,7 +83,7 @@ def write_poses(scan_path: Path, folder: Path, target: Path) -> None:
     cv2.setNumThreads(1)
     scan = read_scan(scan_path)
     raster = nadir_raster(scan)
-    features = raster_features(raster)
+    features = cv2.SIFT_create(20000).detectAndCompute(raster[0], None)
     of_camera: dict[str, list[PosedPicture]] = {}
     for path in (folder / name for name in photo_names(folder)):
         gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -101,7 +100,12 @@ def write_poses(scan_path: Path, folder: Path, target: Path) -> None:
             photos, lens = adjust(photos, lens, free)
             say(f"{sum(len(p.world) for p in photos)} correspondences, focal {lens.values[0]:.1f} px")
         cameras[key] = _camera(photos, lens)
-        poses |= {photo.name: _pose(photo, key) for photo in photos}
+        for photo in photos:
+            poses[photo.name] = {
+                "camera": key,
+                "cam_from_local_rotation": cv2.Rodrigues(photo.pose[:3])[0].tolist(),
+                "cam_from_local_translation": photo.pose[3:].tolist(),
+            }
     document = {"crs": scan.crs, "origin": list(scan.origin), "cameras": cameras, "poses": poses}
     target.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
@@ -121,14 +125,6 @@ def _camera(photos: list[PosedPicture], lens: Lens) -> dict[str, Any]:
         # COLMAP's pixels: centre of the top-left pixel at (0.5, 0.5).
         "params": [f, f, cx + 0.5, cy + 0.5, *distortion],
         "halves_of_photos": halves_of_photos(photos, lens),
-    }
-
-
-def _pose(photo: PosedPicture, key: str) -> dict[str, Any]:
-    return {
-        "camera": key,
-        "cam_from_local_rotation": cv2.Rodrigues(photo.pose[:3])[0].tolist(),
-        "cam_from_local_translation": photo.pose[3:].tolist(),
     }
 
 

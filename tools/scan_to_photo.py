@@ -8,7 +8,6 @@ tracked into the photo at thousands of places, and all photos' poses are estimat
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import laspy
@@ -22,11 +21,12 @@ RENDER_WIDTH = 1600  # px; finer than the scan's points gains nothing
 
 
 @dataclass(frozen=True, slots=True)
-class ColouredScan:
-    """Points in an east-north-up frame at `origin` (easting, northing, height in the file's CRS)."""
+class GrayScan:
+    """Points, and the grey of their colours, in an east-north-up frame at `origin` (easting, northing,
+    height in the file's CRS)."""
 
     xyz: Floats
-    bgr: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
     origin: tuple[float, float, float]
     crs: str
 
@@ -62,7 +62,7 @@ class PosedPicture:
     pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
 
 
-def read_scan(path: Path) -> ColouredScan:
+def read_scan(path: Path) -> GrayScan:
     las = laspy.read(path)
     crs = las.header.parse_crs()
     grid = np.column_stack([las.x, las.y, las.z]).astype(np.float64)
@@ -70,8 +70,8 @@ def read_scan(path: Path) -> ColouredScan:
     rgb = np.column_stack([las.red, las.green, las.blue])
     if rgb.max() > 255:
         rgb = rgb >> 8
-    bgr = np.ascontiguousarray(rgb[:, ::-1].astype(np.uint8))
-    return ColouredScan(_local(grid, crs, origin), bgr, origin, crs.to_string())
+    gray = cv2.cvtColor(rgb[:, None].astype(np.uint8), cv2.COLOR_RGB2GRAY)[:, 0]
+    return GrayScan(_local(grid, crs, origin), gray, origin, crs.to_string())
 
 
 def _local(grid: Floats, crs: pyproj.CRS, origin: tuple[float, float, float]) -> Floats:
@@ -86,8 +86,9 @@ def _local(grid: Floats, crs: pyproj.CRS, origin: tuple[float, float, float]) ->
     return np.column_stack(pipeline.transform(lon, lat, grid[:, 2])).astype(np.float64)
 
 
-def nadir_raster(scan: ColouredScan) -> tuple[NDArray[np.uint8], Floats, Floats]:
-    """The scan from above, north up: picture, heights (NaN where empty) and the south-west corner."""
+def nadir_raster(scan: GrayScan) -> tuple[NDArray[np.uint8], Floats, Floats]:
+    """The scan from above, north up: picture, heights, both filled where no point fell, and the south-west
+    corner."""
     low = scan.xyz.min(axis=0)
     column, row = ((scan.xyz[:, :2] - low[:2]) / RASTER_M).astype(np.int64).T
     shape = (int(row.max()) + 1, int(column.max()) + 1)
@@ -95,16 +96,11 @@ def nadir_raster(scan: ColouredScan) -> tuple[NDArray[np.uint8], Floats, Floats]
     heights = np.full(shape, np.nan)
     heights[row[order], column[order]] = scan.xyz[order, 2]
     picture = np.zeros(shape, np.uint8)
-    gray = cv2.cvtColor(scan.bgr[:, None], cv2.COLOR_BGR2GRAY)[:, 0]
-    picture[row[order], column[order]] = gray[order]
+    picture[row[order], column[order]] = scan.gray[order]
     empty = np.isnan(heights).astype(np.uint8)
     filled = cv2.inpaint(picture, empty, 3, cv2.INPAINT_TELEA)
-    return filled[::-1].copy(), heights[::-1].copy(), low
-
-
-def raster_features(raster: tuple[NDArray[np.uint8], Floats, Floats]) -> tuple[Any, Any]:
-    """SIFT keypoints and descriptors of the raster's picture."""
-    return cv2.SIFT_create(20000).detectAndCompute(raster[0], None)
+    known = np.nan_to_num(heights[::-1], nan=0).astype(np.float32)
+    return filled[::-1].copy(), cv2.inpaint(known, empty[::-1].copy(), 3, cv2.INPAINT_NS), low
 
 
 def first_pose(photo: NDArray[np.uint8], lens: Lens, raster: tuple, scan_features: tuple) -> Floats | None:
@@ -119,9 +115,7 @@ def first_pose(photo: NDArray[np.uint8], lens: Lens, raster: tuple, scan_feature
     scale = photo.shape[1] / small.shape[1]
     pixels = np.array([found[m.queryIdx].pt for m in pairs]) * scale
     at = np.array([keypoints[m.trainIdx].pt for m in pairs])
-    known, empty = np.nan_to_num(heights, nan=0).astype(np.float32), np.isnan(heights).astype(np.uint8)
-    filled = cv2.inpaint(known, empty, 3, cv2.INPAINT_NS)
-    up = filled[at[:, 1].round().astype(int), at[:, 0].round().astype(int)]
+    up = heights[at[:, 1].round().astype(int), at[:, 0].round().astype(int)]
     east, north = at[:, 0] + 0.5, picture.shape[0] - at[:, 1] - 0.5
     world = np.column_stack([low[0] + east * RASTER_M, low[1] + north * RASTER_M, up])
     camera = lens.matrix(), lens.distortion()
@@ -133,9 +127,7 @@ def first_pose(photo: NDArray[np.uint8], lens: Lens, raster: tuple, scan_feature
     return np.concatenate([rvec.ravel(), tvec.ravel()])
 
 
-def render(
-    scan: ColouredScan, lens: Lens, pose: Floats
-) -> tuple[NDArray[np.uint8], NDArray[np.int64], Floats]:
+def render(scan: GrayScan, lens: Lens, pose: Floats) -> tuple[NDArray[np.uint8], NDArray[np.int64], Floats]:
     """Gray picture, point index (-1 where empty) and the points' projections, by splats in order of depth."""
     rotation = cv2.Rodrigues(pose[:3])[0]
     camera_points = scan.xyz @ rotation.T + pose[3:]
@@ -166,12 +158,11 @@ def render(
         # Nearer by more than a surface's own unevenness, or as near and closer to the splat's centre.
         better = layer < nearest + 0.15
         nearest[better], index[better] = layer[better], layer_index[better]
-    gray = cv2.cvtColor(scan.bgr[:, None], cv2.COLOR_BGR2GRAY)[:, 0]
-    picture = np.where(index >= 0, gray[index], 0).astype(np.uint8)
+    picture = np.where(index >= 0, scan.gray[index], 0).astype(np.uint8)
     return picture, index, projected
 
 
-def correspond(photo: PosedPicture, lens: Lens, scan: ColouredScan) -> PosedPicture:
+def correspond(photo: PosedPicture, lens: Lens, scan: GrayScan) -> PosedPicture:
     """The photo with new correspondences: places of the render tracked into the photo."""
     small = lens.scaled(RENDER_WIDTH)
     picture, index, projected = render(scan, small, photo.pose)

@@ -62,9 +62,6 @@ class CommandProcess:
     def log(self) -> list[dict[str, Any]]:
         return [json.loads(line) for line in self.errors if line.startswith("{")]
 
-    def memory_mib(self) -> float:
-        return memory_mib(self.process.pid)
-
 
 class ServeProcess(CommandProcess):
     """`featuredb serve`, on a free port where no configuration says another."""

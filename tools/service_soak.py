@@ -8,13 +8,11 @@ question must have an answer or an error of the server's, and the memory must st
 import os
 import random
 import signal
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import cycle
-from pathlib import Path
 from statistics import median
 
 from featuredb.errors import ServiceError
@@ -27,7 +25,6 @@ from tools.serve_process import watched_memory
 from tools.service_world import (
     ATTACKER,
     Service,
-    first_answers,
     honest_clients,
     moved,
     photos_of,
@@ -41,9 +38,9 @@ _EVENT_S = 5.0  # between two of what happens beside the queries
 class Events:
     """What happens beside the queries. Attributes: counts, by what it was."""
 
-    def __init__(self, database: Database, service: Service, photo: bytes, seed: int) -> None:
+    def __init__(self, database: Database, service: Service, seed: int) -> None:
         self.counts: Counter[str] = Counter()
-        self._database, self._service, self._photo = database, service, photo
+        self._database, self._service, self._photo = database, service, service.photos[0]
         self._rng = random.Random(seed)
         self._original = first_map(database)
         self._turns = cycle((self._commit, self._kill, self._send_broken, self._retire, self._kill))
@@ -78,22 +75,19 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0)
     args = parser.parse_args()
     database = Database.open(args.db)
-    photos = photos_of(args.photos, 4)
-    with tempfile.TemporaryDirectory() as scratch:
-        with running_service(args.db, Path(scratch)) as service:
-            expected = first_answers(service, photos)
-            events = Events(database, service, photos[0], seed=1)
-            end = time.monotonic() + 60 * args.minutes
-            with (
-                watched_memory(service.server.process.pid, every_s=5.0) as memory,
-                honest_clients(service, photos, expected) as heard,
-            ):
-                while time.monotonic() < end:
-                    time.sleep(_EVENT_S)
-                    events.next()
-            with Client(config_path=service.config(ATTACKER)) as client:
-                status = client.status()
-        exit_code = service.server.process.returncode
+    with running_service(args.db, photos_of(args.photos, 4)) as service:
+        events = Events(database, service, seed=1)
+        end = time.monotonic() + 60 * args.minutes
+        with (
+            watched_memory(service.server.process.pid, every_s=5.0) as memory,
+            honest_clients(service) as heard,
+        ):
+            while time.monotonic() < end:
+                time.sleep(_EVENT_S)
+                events.next()
+        with Client(config_path=service.config(ATTACKER)) as client:
+            status = client.status()
+    exit_code = service.server.process.returncode
     failures = Counter(heard.failures)
     quarter = len(memory) // 4
     early, late = median(memory[quarter : 2 * quarter]), median(memory[-quarter:])

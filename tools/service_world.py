@@ -6,6 +6,7 @@ import os
 import shutil
 import socket
 import subprocess
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -139,25 +140,33 @@ def free_port() -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """A server with keys, and a gateway before it; the authority's folder, and the port of the proxy."""
+    """A server with keys, and a gateway before it.
+
+    Attributes:
+        keys: the authority's folder. port: of the proxy. photos: that clients ask.
+        expected: answers when nobody else asks: to each photo with its position, then to each without.
+    """
 
     server: ServeProcess
     gateway: CommandProcess
     keys: Path
     port: int
+    photos: Sequence[bytes]
+    expected: list[LocaliseReply] = field(default_factory=list)
 
     def config(self, client: str) -> Path:
         return self.keys / "clients" / f"{client}.json5"
 
 
 @contextmanager
-def running_service(database: Path, work: Path) -> Iterator[Service]:
+def running_service(database: Path, photos: Sequence[bytes]) -> Iterator[Service]:
     """As `featuredb keys` ships it, behind the proxy of `deploy/`; all end by SIGTERM."""
-    port, behind, keys = free_port(), free_port(), work / f"keys-{time.time_ns()}"
-    authority = Authority.create(keys, port=port)
-    for name in (*HONEST, ATTACKER, WEB):
-        authority.add_client(name)
+    port, behind = free_port(), free_port()
     with ExitStack() as stack:
+        keys = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "keys"
+        authority = Authority.create(keys, port=port)
+        for name in (*HONEST, ATTACKER, WEB):
+            authority.add_client(name)
         words = ("--config", keys / "server.json5", "--listen", f"tls/127.0.0.1:{behind}")
         server = ServeProcess(database, *words, "--deadline", DEADLINE_S)
         stack.callback(server.stop)
@@ -165,7 +174,11 @@ def running_service(database: Path, work: Path) -> Iterator[Service]:
         words = ("--config", keys / f"clients/{WEB}.json5", "--port", free_port())
         gateway = CommandProcess("gateway", *words, "--timeout", DEADLINE_S)
         stack.callback(gateway.stop)
-        yield Service(server=server, gateway=gateway, keys=keys, port=port)
+        service = Service(server=server, gateway=gateway, keys=keys, port=port, photos=photos)
+        with Client(config_path=service.config(HONEST[0])) as client:
+            for prior, photo in product((True, False), photos):
+                service.expected.append(client.localise(photo, exif_prior=prior, timeout_s=60.0))
+        yield service
 
 
 @dataclass(slots=True)
@@ -201,22 +214,14 @@ def same_place(reply: LocaliseReply, expected: LocaliseReply) -> bool:
     return float(np.linalg.norm(np.subtract(a, b))) < _SAME_M
 
 
-def first_answers(service: Service, photos: Sequence[bytes]) -> list[LocaliseReply]:
-    """What each photo is answered when nobody else asks: with its position, then without."""
-    with Client(config_path=service.config(HONEST[0])) as client:
-        asked = product((True, False), photos)
-        return [client.localise(photo, exif_prior=prior, timeout_s=60.0) for prior, photo in asked]
-
-
 @contextmanager
-def honest_clients(
-    service: Service, photos: Sequence[bytes], expected: Sequence[LocaliseReply]
-) -> Iterator[Heard]:
+def honest_clients(service: Service) -> Iterator[Heard]:
     """Within the block each honest client asks again and again, after a pause; one of them anew connected.
 
     Every other question comes without a prior: it is looked for in all maps.
     """
     heard, stop = Heard(), threading.Event()
+    photos, expected = service.photos, service.expected
 
     def ask(client: Client, number: int) -> None:
         which = number % len(expected)

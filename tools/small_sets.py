@@ -40,20 +40,19 @@ def main() -> None:
     parser = scan_parser(__doc__, "--work")
     parser.add_argument("folders", type=Path, nargs="*", metavar="FOLDER", help="with laser truth")
     args = parser.parse_args()
-    squares: dict[str, list[float]] = {"orientation": [], "position": []}
-    runs = maps = active = 0
+    squares: list[dict[str, list[float]]] = []
+    runs = active = 0
     focal_off = 0.0
     for run in (*_by_scan(args), *(made for folder in args.folders for made in _by_laser(folder, args.work))):
         make(run.folder / "db", "photos", run.folder / "photos", ("--work", str(run.folder.parent / "cache")))
         placed = [one for one in all_maps(run.folder / "db") if isinstance(one, FeatureMap)]
         shutil.rmtree(run.folder)
-        runs, maps = runs + 1, maps + len(placed)
-        active += sum(one.status == "active" for one in placed)
+        runs, active = runs + 1, active + sum(one.status == "active" for one in placed)
         for one in placed:
             focal_off = max([focal_off, *(abs(c.focal_px / run.lens.focal_px - 1.0) for c in one.cameras)])
-            for name, of in camera_squares(one, run.frame, run.true).items():
-                squares[name] += of
-    counts = {"runs": runs, "maps": maps, "active": active, "photos": len(squares["position"])}
+            squares.append(camera_squares(one, run.frame, run.true))
+    photos = sum(len(of["position"]) for of in squares)
+    counts = {"runs": runs, "maps": len(squares), "active": active, "photos": photos}
     write_figures(args.json, counts | {"focal_off": focal_off} | bounds_figures(squares))
 
 

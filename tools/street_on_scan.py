@@ -19,7 +19,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.world import Truth, read_truth
 from featuredb.store import Database
 from tools.commands import anchor, featuredb, make, newest_copy, once
-from tools.figures import kept, median, squared, study_parser, write_figures
+from tools.figures import kept, spread, squared, study_parser, write_figures
 from tools.worlds.album import TABLE_FILE, write_album
 from tools.worlds.community import StreetOptions, street_album
 from tools.worlds.scan_world import make_scan_world
@@ -48,8 +48,7 @@ def main() -> None:
             "placed": len(off),
             "right_share": right / max(photos, 1),
             "outside": int((off[:, 2] > _OUTSIDE_M).sum()),
-            "median_m": median(off[:, 0]),
-            "largest_m": float(off[:, 0].max(initial=0.0)),
+            **spread(off[:, 0]),
             "elsewhere": sum(len(town["elsewhere"]) for town in towns),
             "elsewhere_placed": sum(bool(one["off"]) for town in towns for one in town["elsewhere"]),
         },

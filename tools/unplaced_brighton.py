@@ -38,6 +38,7 @@ _DRAWS, _NEAR_DRAWS, _SEED = 20, 10, 1
 _KINDS = ("colour", "intensity", "mirrored")
 _AWAY_M, _RADIUS_M = 100.0, 250.0
 _GREY = np.array([0.299, 0.587, 0.114])
+_WITHOUT_COLOUR = 1  # of the point formats of LAS
 
 
 def main() -> None:
@@ -126,19 +127,16 @@ def scan_of(kind: str, scan: Path, work: Path) -> Path:
     if kind == "colour":
         return scan
     read = laspy.read(scan)
-    made = laspy.LasData(laspy.LasHeader(point_format=6 if kind == "intensity" else 7, version="1.4"))
-    made.header.offsets, made.header.scales = read.header.offsets, read.header.scales
-    made.header.add_crs(read.header.parse_crs())
-    xyz, rgb = np.asarray(read.xyz), np.column_stack([read.red, read.green, read.blue])
     if kind == "intensity":
+        rgb = np.column_stack([read.red, read.green, read.blue])
         grey = rgb @ _GREY * (65535 / max(int(rgb.max()), 1))
-        made.intensity = np.asarray(np.minimum(grey, 65535), np.uint16)
+        read = laspy.convert(read, point_format_id=_WITHOUT_COLOUR)
+        read.intensity = np.asarray(np.minimum(grey, 65535), np.uint16)
     else:
-        xyz[:, 0] = xyz[:, 0].min() + xyz[:, 0].max() - xyz[:, 0]
-        made.red, made.green, made.blue = rgb.T
-    made.x, made.y, made.z = xyz.T
+        east = np.asarray(read.x)
+        read.x = east.min() + east.max() - east
     path = work / f"{kind}.laz"
-    made.write(path)
+    read.write(path)
     return path
 
 

@@ -10,15 +10,9 @@
 
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from tools.commands import featuredb
-from tools.figures import pose_errors, poses_in, spread, study_parser, write_figures
+from tools.figures import laid_poses, pose_errors, poses_in, spread, study_parser, write_figures
 from tools.photo_files import copied, photo_names
 from tools.real_photos import ingest, reference
 
@@ -45,7 +39,7 @@ def main() -> None:
         "grown": len(maps["loose"].images) if "loose" in maps else 0,
         "strange_placed": int("strange" in maps),
     }
-    poses = placed_like(maps["placed"], truth)
+    poses = laid_poses(poses_in(truth.frame, truth), poses_in(truth.frame, maps["placed"]))
     for name in ("placed", "loose"):
         if name in maps:
             off = spread(*pose_errors(poses_in(truth.frame, maps[name]), poses))
@@ -53,19 +47,6 @@ def main() -> None:
     if "loose" in maps:
         figures["bound_m"] = maps["loose"].placement.evidence["growth"]["drift_m"]
     write_figures(args.json, figures)
-
-
-def placed_like(feature_map: FeatureMap, truth: FeatureMap) -> dict[str, Rigid3]:
-    """The poses of the truth, moved by a similarity to where a map has its photos, turned as these are."""
-    mine, poses = poses_in(truth.frame, feature_map), poses_in(truth.frame, truth)
-    shared = [name for name in mine if name in poses]
-    turn = Rotation.from_matrix([mine[n].rotation.T @ poses[n].rotation for n in shared]).mean().as_matrix()
-    true = np.array([turn @ poses[n].center for n in shared])
-    there = np.array([mine[n].center for n in shared])
-    a, b = true - true.mean(axis=0), there - there.mean(axis=0)
-    scale = float((a * b).sum() / (a * a).sum())
-    move = Sim3(scale=scale, rotation=turn, translation=there.mean(axis=0) - scale * true.mean(axis=0))
-    return {name: move.act_on_pose(pose) for name, pose in poses.items()}
 
 
 if __name__ == "__main__":

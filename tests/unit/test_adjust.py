@@ -10,65 +10,18 @@ from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import (
     Block,
     CenterPriors,
-    LensWidths,
     Marks,
     Orientations,
     PointPriors,
-    Targets,
     Terms,
     lens_prior,
-    surface_priors,
     whole_lens,
 )
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.precision import linearise
-
-WIDTHS = LensWidths(focal_rel=0.02, aspect_rel=0.001, center_rel=0.01, radial=0.05, tangential=0.003)
-TRUE = Camera(
-    model="OPENCV", width=1200, height=900, params=(1010.0, 1009.5, 608.0, 446.0, 0.03, -0.01, 5e-4, -3e-4)
-)
-
-
-def _block(seed: int = 0, points: int = 60, noise_px: float = 0.0) -> Block:
-    """Eight photos on two heights that look down on hills, each point in all of them."""
-    rng = np.random.default_rng(seed)
-    xyz = rng.uniform([-8, -6, -2], [8, 6, 2], (points, 3))
-    poses = []
-    for k in range(8):
-        center = np.array([6 * np.cos(k), 6 * np.sin(k), 18.0 + 3 * (k % 2)])
-        turn = Rigid3.exp(np.concatenate([rng.normal(0, 0.08, 3), np.zeros(3)])).rotation
-        rotation = turn @ np.diag([1.0, -1.0, -1.0])
-        poses.append(Rigid3(rotation=rotation, translation=-rotation @ center))
-    photo_of, point_of = (a.ravel() for a in np.meshgrid(np.arange(8), np.arange(points)))
-    pixels = np.concatenate([TRUE.project(pose.act(xyz)) for pose in poses]).reshape(8, points, 2)
-    xy = pixels[photo_of, point_of] + rng.normal(0, 1, (len(photo_of), 2)) * noise_px
-    return Block(
-        names=tuple(f"{k}" for k in range(8)),
-        cameras=(TRUE,),
-        camera_of=np.zeros(8, np.int64),
-        cam_from_block=tuple(poses),
-        xyz=xyz,
-        point_of=point_of.astype(np.int64),
-        photo_of=photo_of.astype(np.int64),
-        xy=xy,
-    )
-
-
-def _terms(block: Block, lens: Camera, keypoint_px: float = 0.5) -> Terms:
-    """All terms: positions, control that two photos show, a surface below half of the points."""
-    seen = block.cam_from_block[2].act(block.xyz[:9])
-    offset = np.where(np.arange(len(block.xyz)) % 2 == 0, 0.0, np.nan)
-    return Terms(
-        keypoint_px=keypoint_px,
-        lenses=(lens_prior(lens, WIDTHS),),
-        marks=Marks(xyz=block.xyz[:9], photo_of=np.full(9, 2, np.int64), xy=TRUE.project(seen), sigma_px=1.0),
-        points=surface_priors(block.xyz, offset, np.tile([0.0, 0.0, 1.0], (len(block.xyz), 1)), 0.05),
-        centers=CenterPriors(
-            photo_of=np.arange(8), xyz=block.centers(), covariance=np.tile(np.eye(3) * 0.05**2, (8, 1, 1))
-        ),
-    )
+from tests.support.adjusted_block import TRUE, WIDTHS, adjusted_block, adjusted_terms
 
 
 def _cost(block: Block, terms: Terms) -> float:
@@ -102,8 +55,8 @@ def _mahalanobis(off: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def test_no_direction_lowers_the_cost_of_what_is_found() -> None:
-    block, rng = _block(noise_px=0.5), np.random.default_rng(1)
-    terms = _terms(block, replace(TRUE, params=(1000.0, 1000.0, 600.0, 450.0, 0.0, 0.0, 0.0, 0.0)))
+    block, rng = adjusted_block(noise_px=0.5), np.random.default_rng(1)
+    terms = adjusted_terms(block, replace(TRUE, params=(1000.0, 1000.0, 600.0, 450.0, 0.0, 0.0, 0.0, 0.0)))
     problem = Problem(block, terms)
     problem.solve(50, 1e-12)
     found = problem.block()
@@ -131,7 +84,7 @@ def test_no_direction_lowers_the_cost_of_what_is_found() -> None:
 @pytest.mark.parametrize(("robust", "focal_px"), [(True, 1008.3), (False, 995.0)])
 def test_a_prior_lets_go_unless_the_lens_is_known_for_certain(robust: bool, focal_px: float) -> None:
     """Known points say 1010 px; 990 px within 1 px were told, which a robust prior takes for a mistake."""
-    block = _block(noise_px=0.5)
+    block = adjusted_block(noise_px=0.5)
     told = replace(TRUE, params=(990.0, 989.5, *TRUE.params[2:]))
     terms = Terms(
         keypoint_px=0.5,
@@ -144,8 +97,10 @@ def test_a_prior_lets_go_unless_the_lens_is_known_for_certain(robust: bool, foca
 
 
 def test_the_whole_lens_is_found_through_a_plain_prior() -> None:
-    block = _block(points=200, noise_px=0.2)
-    terms = _terms(block, replace(TRUE, params=(1000.0, 1000.0, 600.0, 450.0, 0.0, 0.0, 0.0, 0.0)), 0.2)
+    block = adjusted_block(points=200, noise_px=0.2)
+    terms = adjusted_terms(
+        block, replace(TRUE, params=(1000.0, 1000.0, 600.0, 450.0, 0.0, 0.0, 0.0, 0.0)), 0.2
+    )
     problem = Problem(block, terms)
     problem.solve(50, 1e-12)
     off = np.array(problem.block().cameras[0].params) - np.array(TRUE.params)
@@ -155,9 +110,9 @@ def test_the_whole_lens_is_found_through_a_plain_prior() -> None:
 
 
 def test_an_adjustment_that_was_stopped_on_its_way_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    block = _block(points=200, noise_px=0.2)
+    block = adjusted_block(points=200, noise_px=0.2)
     wrong = replace(block, cameras=(replace(TRUE, params=(1500.0, 1500.0, *TRUE.params[2:])),))
-    problem = Problem(wrong, _terms(block, TRUE))
+    problem = Problem(wrong, adjusted_terms(block, TRUE))
     with caplog.at_level("INFO", logger="featuredb.adjust"):
         problem.solve(2, 1e-12)
         assert "stopped on its way after 2 steps" in caplog.text
@@ -168,9 +123,9 @@ def test_an_adjustment_that_was_stopped_on_its_way_says_so(caplog: pytest.LogCap
 
 def test_a_focal_length_that_is_far_off_loses_to_photos_that_know() -> None:
     """EXIF of a cropped photo: 30 % off, 15 of its sigmas."""
-    block = _block(points=200, noise_px=0.2)
+    block = adjusted_block(points=200, noise_px=0.2)
     wrong = replace(TRUE, params=(1300.0, 1300.0, *TRUE.params[2:]))
-    problem = Problem(block, replace(_terms(block, wrong, 0.2), dilution=50.0))
+    problem = Problem(block, replace(adjusted_terms(block, wrong, 0.2), dilution=50.0))
     problem.solve(50, 1e-12)
     assert problem.block().cameras[0].focal_px == pytest.approx(TRUE.focal_px, rel=0.01)
 
@@ -178,10 +133,12 @@ def test_a_focal_length_that_is_far_off_loses_to_photos_that_know() -> None:
 def test_positions_that_are_known_exactly_outweigh_what_the_lens_model_leaves_over() -> None:
     """A distortion that is held at zero bends the block; diluted, it stays where its positions are."""
     bent = replace(TRUE, params=(*TRUE.params[:4], 0.0, 0.0, 0.0, 0.0))
-    block = replace(_block(points=200, noise_px=0.2), cameras=(bent,))
+    block = replace(adjusted_block(points=200, noise_px=0.2), cameras=(bent,))
     off = []
     for dilution in (1.0, 1000.0):
-        terms = replace(_terms(block, bent, 0.2), lenses=(None,), marks=None, points=None, dilution=dilution)
+        terms = replace(
+            adjusted_terms(block, bent, 0.2), lenses=(None,), marks=None, points=None, dilution=dilution
+        )
         problem = Problem(block, terms)
         problem.solve(50, 1e-12)
         off.append(float(np.linalg.norm(problem.block().centers() - block.centers(), axis=1).max()))
@@ -193,9 +150,9 @@ def test_covariances_hold_what_draws_scatter() -> None:
     squares: list[tuple[float, float]] = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        block = _block(seed=7, noise_px=0.0)
+        block = adjusted_block(seed=7, noise_px=0.0)
         true_lens = np.array(TRUE.params)
-        terms = _terms(block, TRUE)
+        terms = adjusted_terms(block, TRUE)
         assert terms.marks is not None
         assert terms.points is not None
         assert terms.centers is not None
@@ -236,7 +193,7 @@ def _squares(problem: Problem, truth: Block, found: Marginals) -> tuple[float, f
 
 def test_points_move_with_poses_and_lenses_as_is_said() -> None:
     """Against points that are intersected anew after a pose and a lens have changed by little."""
-    block, px = _block(), 0.5
+    block, px = adjusted_block(), 0.5
     problem = Problem(block, Terms(keypoint_px=px, lenses=(lens_prior(TRUE, WIDTHS),)))
     found, (rows, moved, information) = problem.marginals(), problem.points_by_shared()
     np.testing.assert_array_equal(rows, np.arange(len(block.xyz)))
@@ -259,7 +216,7 @@ def test_points_move_with_poses_and_lenses_as_is_said() -> None:
 
 def test_a_point_behind_all_cameras_breaks_no_covariance() -> None:
     """No residual depends on it: as if it were not there."""
-    block = whole_lens(_block())
+    block = whole_lens(adjusted_block())
     xyz = block.xyz.copy()
     xyz[-1, 2] = 500.0
     behind = replace(block, xyz=xyz)
@@ -271,13 +228,13 @@ def test_a_point_behind_all_cameras_breaks_no_covariance() -> None:
         photo_of=block.photo_of[rest],
         xy=block.xy[rest],
     )
-    found, expected = (Problem(one, _terms(one, TRUE)).marginals() for one in (behind, without))
+    found, expected = (Problem(one, adjusted_terms(one, TRUE)).marginals() for one in (behind, without))
     np.testing.assert_allclose(found.pose(1), expected.pose(1), rtol=1e-4, atol=1e-12)
 
 
 def test_what_is_held_stays_and_has_no_covariance() -> None:
-    block = _block(noise_px=0.5)
-    terms = replace(_terms(block, TRUE), lenses=(None,), held_photos=(3,))
+    block = adjusted_block(noise_px=0.5)
+    terms = replace(adjusted_terms(block, TRUE), lenses=(None,), held_photos=(3,))
     problem = Problem(block, terms)
     problem.solve(20, 1e-9)
     found, covariance = problem.block(), problem.marginals()
@@ -288,46 +245,14 @@ def test_what_is_held_stays_and_has_no_covariance() -> None:
     assert np.linalg.norm(found.cam_from_block[4].center - block.cam_from_block[4].center) > 0
 
 
-def test_a_photo_that_sees_marks_alone_is_placed_by_them() -> None:
-    """COLMAP makes no parameters of a photo without points; its covariance is that of a resection."""
-    block = _block(noise_px=0.0)
-    rng = np.random.default_rng(3)
-    xyz = block.xyz[np.unique(block.point_of[block.photo_of == 2])]
-    true = block.cam_from_block[2]
-    xy = TRUE.project(true.act(xyz))
-    others = block.photo_of != 2
-    poses = list(block.cam_from_block)
-    poses[2] = Rigid3.exp(rng.normal((0, 0, 0, 0, 0, -2.0), 0.01)) @ true
-    block = replace(
-        block,
-        cam_from_block=tuple(poses),
-        point_of=block.point_of[others],
-        photo_of=block.photo_of[others],
-        xy=block.xy[others],
-    )
-    marks = Marks(xyz=xyz, photo_of=np.full(len(xyz), 2), xy=xy, sigma_px=0.5)
-    terms = Terms(keypoint_px=0.5, lenses=(None,), marks=marks, held_photos=(0, 1))
-    problem = Problem(replace(block, cameras=(TRUE,)), terms)
-    problem.solve(50, 1e-14)
-    found = problem.block()
-    assert np.abs((found.cam_from_block[2] @ true.inverse()).log()).max() < 1e-6
-    by_pose = linearise(
-        [TRUE], np.zeros(1, np.int64), [true], xyz, np.arange(len(xyz)), 0 * marks.photo_of, xy
-    )
-    rows = by_pose.by_pose.reshape(-1, 6) / 0.5
-    np.testing.assert_allclose(
-        problem.marginals().pose(2), np.linalg.inv(rows.T @ rows), rtol=1e-3, atol=1e-9
-    )
-
-
 def test_points_go_where_their_priors_want_them() -> None:
-    block = _block()
+    block = adjusted_block()
     up = PointPriors(
         point_of=np.arange(60),
         xyz=block.xyz + np.array([0.0, 0.0, 0.4]),
         covariance=np.tile(np.eye(3) * 1e-6, (60, 1, 1)),
     )
-    problem = Problem(block, replace(_terms(block, TRUE), marks=None, points=up))
+    problem = Problem(block, replace(adjusted_terms(block, TRUE), marks=None, points=up))
     problem.solve(50, 1e-12)
     assert np.median(problem.block().xyz[:, 2] - block.xyz[:, 2]) == pytest.approx(0.4, abs=0.01)
 
@@ -340,78 +265,16 @@ def test_a_whole_lens_is_the_same_lens() -> None:
         Camera(model="PINHOLE", width=800, height=600, params=(700.0, 710.0, 401.0, 299.0)),
     )
     for lens in lenses:
-        whole = whole_lens(replace(_block(), cameras=(lens,))).cameras[0]
+        whole = whole_lens(replace(adjusted_block(), cameras=(lens,))).cameras[0]
         assert whole.model == "OPENCV"
         np.testing.assert_allclose(whole.project(rays), lens.project(rays), atol=1e-9)
     fisheye = Camera.from_focal(800, 600, 400.0, "OPENCV_FISHEYE")
-    assert whole_lens(replace(_block(), cameras=(fisheye,))).cameras == (fisheye,)
-
-
-def _with_targets(rng: np.random.Generator, without: int | None = None) -> tuple[Block, Terms, FloatArray]:
-    """A block whose first six points are marked in three photos each and surveyed, but for one perhaps."""
-    block = _block(points=80, noise_px=0.3)
-    photo_of, point_of = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(6)))
-    seen = [TRUE.project(block.cam_from_block[k].act(block.xyz[:6])) for k in range(3)]
-    xy = np.array(seen)[photo_of, point_of] + rng.normal(0, 1.0, (18, 2))
-    surveyed = block.xyz[:6] + rng.normal(0, 0.05, (6, 3))
-    kept = np.array([i for i in range(6) if i != without])
-    targets = Targets(
-        point_of=len(block.xyz) + point_of,
-        photo_of=photo_of,
-        xy=xy,
-        sigma_px=1.0,
-        survey=PointPriors(
-            point_of=len(block.xyz) + kept,
-            xyz=surveyed[kept],
-            covariance=np.tile(np.eye(3) * 0.05**2, (len(kept), 1, 1)),
-        ),
-    )
-    terms = Terms(keypoint_px=0.3, lenses=(lens_prior(TRUE, WIDTHS),), targets=targets)
-    start = block.xyz[:6] + rng.normal(0, 0.1, (6, 3))
-    return replace(block, xyz=np.concatenate([block.xyz, start])), terms, surveyed
-
-
-def test_a_residual_says_what_it_would_be_without_its_observation() -> None:
-    block, terms, surveyed = _with_targets(np.random.default_rng(3))
-    problem = Problem(block, terms)
-    problem.solve(100, 1e-14, 1e9)
-    found = problem.target_marginals()
-    # Of 18 marks of two and 6 points of three coordinates, less those points, a similarity and the lens.
-    redundancy = np.trace(found.marks.covariance, axis1=1, axis2=2).sum()
-    redundancy += np.trace(found.survey.covariance, axis1=1, axis2=2).sum()
-    assert 54 - 18 - 7 - 8 < redundancy < 54 - 18 - 7 + 0.1
-    told = found.survey.of(np.ones((6, 3), bool)).left_out(np.arange(6, 9))[0] * 0.05
-    assert np.linalg.norm(told) > np.linalg.norm(found.survey.residual[2] * 0.05)
-    block, terms, _ = _with_targets(np.random.default_rng(3), without=2)
-    problem = Problem(block, terms)
-    problem.solve(100, 1e-14, 1e9)
-    again = problem.block().xyz[80 + 2] - surveyed[2]
-    np.testing.assert_allclose(told, again, atol=0.003)
-    spread = np.sqrt(np.diag(problem.target_marginals().point[2]))
-    assert (np.abs(problem.block().xyz[82] - block.xyz[2]) < 4 * spread).all()
-
-
-def test_a_wrong_mark_has_the_largest_statistic() -> None:
-    block, terms, _ = _with_targets(np.random.default_rng(5))
-    assert terms.targets is not None
-    xy = terms.targets.xy.copy()
-    xy[7] += [9.0, -12.0]
-    problem = Problem(block, replace(terms, targets=replace(terms.targets, xy=xy)))
-    problem.solve(100, 1e-14, 1e9)
-    marks = problem.target_marginals().marks
-    single = marks.of(np.ones((18, 2), bool))
-    alone = [single.left_out(2 * k + np.arange(2))[0] for k in range(18)]
-    assert int(np.argmax([a @ v for a, v in zip(alone, marks.residual, strict=True)])) == 7
-    np.testing.assert_allclose(alone[7], [-9.0, 12.0], atol=5.0)
-    # Without it the others fit each other: a chi-square of as many degrees as their redundancy.
-    others = single.left_out(14 + np.arange(2))[1]
-    assert (others.residual**2).sum() < 2.0 * np.trace(others.together)
-    assert (marks.residual**2).sum() > 4.0 * np.trace(marks.together)
+    assert whole_lens(replace(adjusted_block(), cameras=(fisheye,))).cameras == (fisheye,)
 
 
 def test_orientations_turn_a_block_that_nothing_else_holds() -> None:
     """A tilt of five degrees that is known to one, from positions that know it to far less."""
-    block = _block(points=100)
+    block = adjusted_block(points=100)
     turn = Rigid3.exp([np.radians(5.0), 0.0, 0.0, 0.0, 0.0, 0.0]).rotation
     covariance = np.diag([np.radians(1.0) ** 2, np.radians(1.0) ** 2, 100.0])
     terms = Terms(

@@ -22,7 +22,7 @@ WALK = WalkOptions()
 
 def test_another_seed_is_another_world(tmp_path: Path) -> None:
     def told(*words: str) -> CommunityOptions:
-        return world_told("", ["--work", str(tmp_path / "kept"), *words], CommunityOptions)[1]
+        return world_told("", CommunityOptions, ["--work", str(tmp_path / "kept"), *words])[1]
 
     assert told() == CommunityOptions(seed=1)
     assert told("--seed", "7") == CommunityOptions(seed=7)

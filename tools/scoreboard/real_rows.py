@@ -61,7 +61,7 @@ REAL: tuple[Row, ...] = (
     _row(
         name="mixed-folder",
         claim="eight sets of seven places by many cameras, with positions and without, in one folder",
-        commands="tools.mixed_folder "
+        commands="tools.made_maps "
         + " ".join(
             f"{name}={{data}}/{name}/images" for name in ("brighton", "lewis", "seneca", "copr", "reichstag")
         )
@@ -304,7 +304,7 @@ REAL: tuple[Row, ...] = (
     _row(
         name="copr-control-points",
         claim="`copr`: 41 kite photos without GPS, placed by ten ground control points, good to 0.8 m",
-        commands=f"tools.made_maps --photos {{data}}/copr/images --gcp {{data}}/copr/gcp_list.txt "
+        commands="tools.made_maps copr={data}/copr/images --gcp {data}/copr/gcp_list.txt "
         f"--work {{work}}/maps {OUT}",
         text="{largest} of {photos} in a map, {placed} placed, residual {residual_m:.2f} m",
         limits="38 <= largest, 1 <= placed, residual_m <= 1.5",
@@ -326,7 +326,7 @@ REAL: tuple[Row, ...] = (
     _row(
         name="seneca-map",
         claim="`seneca`: 60 photos of a flying wing over bare fields become a map",
-        commands=f"tools.made_maps --photos {{data}}/seneca/images --work {{work}}/maps {OUT}",
+        commands=f"tools.made_maps seneca={{data}}/seneca/images --work {{work}}/maps {OUT}",
         text="{largest} in the largest of {maps} maps, {mapped} in all",
         limits="54 <= largest",
         minutes=5,

@@ -117,18 +117,15 @@ class Row:
 
     def words(self, figures: Figures) -> str:
         """The figures in words; what is missing shows as a dash."""
-        return string.Formatter().vformat(self.text, (), _Dashes(figures))
+        return _Words().vformat(self.text, (), figures)
 
 
-class _Dash:
-    def __format__(self, _: str) -> str:
-        return "-"
+class _Words(string.Formatter):
+    def get_value(self, key: Any, args: Any, kwargs: Figures) -> Any:
+        return kwargs.get(key)
 
-
-class _Dashes(dict[str, Any]):
-    def __getitem__(self, key: str) -> Any:
-        value = super().get(key)
-        return _Dash() if value is None else value
+    def format_field(self, value: Any, format_spec: str) -> Any:
+        return "-" if value is None else super().format_field(value, format_spec)
 
 
 def _at(document: Mapping[str, Any], name: str) -> float | int | str | None:

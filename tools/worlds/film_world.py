@@ -249,7 +249,7 @@ def write_film(folder: Path, options: FilmOptions, workers: int = 0) -> Path:
 
 def film_truth(options: FilmOptions) -> FilmTruth:
     """The truth of a film."""
-    scene, path, frames = _scene(options, True), _path(options, True), range(options.frames)
+    scene, path, frames = _scene(options, True), flight_path(options), range(options.frames)
     return FilmTruth(
         camera=options.camera,
         frame=scene.frame,
@@ -262,7 +262,7 @@ def film_truth(options: FilmOptions) -> FilmTruth:
 def film_frame(options: FilmOptions, frame: int) -> Image8:
     """One frame (h, w, 3) uint8 RGB as the camera's sensor gives it."""
     home, time_s, n = options.at_home(frame), options.time_s(frame), options.samples
-    scene, path, camera = _scene(options, home), _path(options, home), options.camera_at(frame)
+    scene, path, camera = _scene(options, home), flight_path(options, home), options.camera_at(frame)
     look = scene_look(scene, water_seed=int(time_s * _GLITTER_HZ))
     faces = Faces.concatenate([scene.faces, moving_cars(scene, options.path.seed, time_s=time_s)])
     light: NDArray[np.float32] = np.zeros((camera.height, camera.width, 3), np.float32)
@@ -304,7 +304,8 @@ def _scene(options: FilmOptions, home: bool) -> Scene:
 
 
 @lru_cache(maxsize=8)
-def _path(options: FilmOptions, home: bool) -> FlightPath:
+def flight_path(options: FilmOptions, home: bool = True) -> FlightPath:
+    """How the camera of a film flies, over its town or over the other one."""
     path = replace(options.path, duration_s=options.frames / options.rate_hz)
     return FlightPath(_scene(options, home), path)
 
@@ -317,7 +318,7 @@ def _telemetry(options: FilmOptions) -> str:
     for i, error in enumerate(wandering_errors(rng, GPS_SIGMA_M, keep, options.frames)):
         time_s, home = options.time_s(i), options.at_home(i)
         frame = _scene(options, home).frame
-        place = _path(options, home).pose(time_s - TELEMETRY_LATE_S).center + error
+        place = flight_path(options, home).pose(time_s - TELEMETRY_LATE_S).center + error
         latitude, longitude, height = (float(v) for v in frame.geodetic_from_enu(place))
         moment = _START + timedelta(seconds=time_s)
         blocks.append(
