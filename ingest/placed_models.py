@@ -20,7 +20,6 @@ from ingest.photos.photo import Photo, capture_seconds, gps_priors, local_frame_
 from ingest.positions.receivers import receivers
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.register.control.maps import Survey, place_by_survey, vertical_of
-from ingest.register.control.marks import control_frame
 from ingest.register.control.placement import GcpPlacement
 from ingest.register.gps import GpsPlacement, place_by_gps
 from ingest.register.tagged_elsewhere import TaggedElsewhere, rightly_joined, tagged_elsewhere
@@ -285,7 +284,7 @@ def _by_control(
     if by_gps.reason is None and by_gps.local_from_sfm is not None and by_gps.covariance is not None:
         vertical = vertical_of(by_gps.local_from_sfm, by_gps.covariance, block.xyz, "the photos' GPS")
     positions = [photo.gps for photo in component.photos]
-    frame = frame or control_frame(survey.file)
+    frame = frame or LocalFrame.amid(survey.file.lat_lon_h)
     placed = place_by_survey(block, positions, frame, vertical, survey)
     component = replace(component, control=placed)
     if placed.reason is not None:

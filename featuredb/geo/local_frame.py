@@ -55,6 +55,25 @@ class LocalFrame:
         latitude, longitude, h = geodetic_from_utm((easting, northing, height), epsg)
         return cls(latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=float(h))
 
+    @classmethod
+    def about(cls, lat_lon_h: FloatArray) -> Self:
+        """The frame at about this place (3,), whose origin does not depend on the last digits."""
+        latitude, longitude, height = lat_lon_h.tolist()
+        return cls(latitude_deg=round(latitude, 5), longitude_deg=round(longitude, 5), height_m=round(height))
+
+    @classmethod
+    def amid(cls, lat_lon_h: FloatArray) -> Self:
+        """The frame at about the median of places (n, 3), n > 0; heights that are NaN do not count."""
+        latitudes, longitudes, heights = lat_lon_h.T
+        # From about the middle: beside the meridian of 180 degrees longitudes jump.
+        turns = np.exp(1j * np.radians(longitudes))
+        middle = float(np.degrees(np.angle(turns.sum())))
+        east = np.degrees(np.angle(turns * np.exp(-1j * np.radians(middle))))
+        longitude = (middle + float(np.median(east)) + 180.0) % 360.0 - 180.0
+        known = heights[np.isfinite(heights)]
+        height = float(np.median(known)) if len(known) else 0.0
+        return cls.about(np.array([np.median(latitudes), longitude, height]))
+
     def enu_from_utm(self, utm: ArrayLike, epsg: int) -> FloatArray:
         """East, north, up in metres of UTM easting, northing, height.
 

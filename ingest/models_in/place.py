@@ -17,7 +17,7 @@ from featuredb.maps.feature_map import MAP_METHODS, MapStatus, Placement
 from featuredb.maps.unplaced_map import NoPlace
 from ingest.colmap.bridge import Model
 from ingest.own_frame import WAYS_TO_A_PLACE
-from ingest.photos.photo import Photo, rounded_frame
+from ingest.photos.photo import Photo
 from ingest.placed_models import placed_by_gps
 
 Axes = Literal["enu", "utm", "ecef"]
@@ -179,7 +179,7 @@ def _to_local(model: Model, centers: FloatArray, stated: Stated) -> tuple[Sim3, 
     middle = np.median(centers, axis=0)
     if stated.axes == "enu":
         there = LocalFrame.from_utm(*stated.origin, stated.epsg)
-        frame = rounded_frame(there.geodetic_from_enu(middle))
+        frame = LocalFrame.about(there.geodetic_from_enu(middle))
         return Sim3.from_rigid3(frame.enu_from(there)), frame, 0.0
     if stated.axes == "ecef":
         radius_km = float(np.linalg.norm(middle)) / 1000.0
@@ -187,10 +187,10 @@ def _to_local(model: Model, centers: FloatArray, stated: Stated) -> tuple[Sim3, 
             raise IngestError(
                 f"--axes ecef: expected cameras some 6,370 km from the Earth's centre, found {radius_km:.1f}"
             )
-        frame = rounded_frame(geodetic_from_ecef(middle[None])[0])
+        frame = LocalFrame.about(geodetic_from_ecef(middle[None])[0])
         return Sim3.from_rigid3(frame.ecef_from_enu().inverse()), frame, 0.0
     utm = np.concatenate([centers, model.xyz]) + stated.origin
-    frame = rounded_frame(geodetic_from_utm(middle + stated.origin, stated.epsg))
+    frame = LocalFrame.about(geodetic_from_utm(middle + stated.origin, stated.epsg))
     enu = frame.enu_from_utm(utm, stated.epsg)
     fitted = similarity_closed_form(utm - stated.origin, enu)
     if fitted is None:

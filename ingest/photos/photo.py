@@ -151,15 +151,7 @@ def whose_cameras(photos: Sequence[Photo], focals_px: Sequence[float] = ()) -> N
 def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
     """A frame at the photos' median position."""
     gps = _geodetic(photos)
-    return rounded_frame(np.median(gps, axis=0)) if len(gps) else None
-
-
-def rounded_frame(lat_lon_h: FloatArray) -> LocalFrame:
-    """A frame at about this place (3,), whose origin does not hang on the last digit."""
-    latitude, longitude, height = lat_lon_h.tolist()
-    return LocalFrame(
-        latitude_deg=round(latitude, 5), longitude_deg=round(longitude, 5), height_m=round(height)
-    )
+    return LocalFrame.amid(gps) if len(gps) else None
 
 
 def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> FloatArray:

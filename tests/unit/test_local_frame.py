@@ -239,3 +239,17 @@ def test_utm_at_the_antimeridian_has_a_place(epsg: int) -> None:
     utm = utm_from_geodetic(places, epsg)
     frame = LocalFrame(latitude_deg=latitudes[80], longitude_deg=180.0, height_m=0.0)
     np.testing.assert_allclose(frame.enu_from_utm(utm, epsg), frame.enu_from_geodetic(places), atol=1e-6)
+
+
+@pytest.mark.parametrize("middle", [180.0, -180.0, 0.0, 8.41])
+def test_the_middle_of_places_is_among_them_on_every_meridian(middle: float) -> None:
+    east = np.array([-3e-4, -2e-4, -1e-4, 1e-4, 2e-4, 3e-4])
+    longitude = (middle + east + 180.0) % 360.0 - 180.0
+    places = np.column_stack([np.full(6, -17.0), longitude, [10.0, 11.0, np.nan, 12.0, np.nan, 13.0]])
+    stray = np.array([[60.0, middle / 2.0 + 60.0, 5000.0]])
+    for given in (places, places[::-1], np.concatenate([stray, places])):
+        frame = LocalFrame.amid(given)
+        assert np.abs((frame.longitude_deg - middle + 180.0) % 360.0 - 180.0) < 3e-4
+        assert frame.latitude_deg == -17.0
+        assert 11.0 <= frame.height_m <= 12.0
+    assert LocalFrame.amid(np.array([[48.0, 8.0, np.nan]])).height_m == 0.0

@@ -16,7 +16,7 @@ from featuredb.maps.unplaced_map import UnplacedMap
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.control.control_file import ControlFile
 from ingest.register.control.fit import Vertical
-from ingest.register.control.marks import control_frame, meet
+from ingest.register.control.marks import meet
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
 
 # A local frame is good for tens of kilometres; a new one further away keeps coordinates small.
@@ -109,7 +109,7 @@ def place_unplaced_by_gcp(
         covariance=np.zeros((7, 7)),
         residual_rms_m=0.0,
     )
-    start = placed_map(unplaced, at_the_points, control_frame(survey.file), "unknown")
+    start = placed_map(unplaced, at_the_points, LocalFrame.amid(survey.file.lat_lon_h), "unknown")
     return replace(register_by_gcp(start, survey, height_datum), moved_m=None)
 
 
@@ -146,7 +146,7 @@ def _gps_in(frame: LocalFrame, priors: Sequence[GeoPrior | None]) -> tuple[Float
 
 def _frame(feature_map: FeatureMap, file: ControlFile) -> LocalFrame:
     """The map's own frame unless its photos have no GPS and the control points lie elsewhere."""
-    middle = control_frame(file)
+    middle = LocalFrame.amid(file.lat_lon_h)
     away = np.linalg.norm(feature_map.frame.enu_from(middle).translation)
     has_gps = any(image.gps is not None for image in feature_map.images)
     return feature_map.frame if has_gps or away <= _MAX_FRAME_DISTANCE_M else middle

@@ -47,18 +47,6 @@ class Control:
         return np.flatnonzero(self.point_of == point)
 
 
-def control_frame(file: ControlFile) -> LocalFrame:
-    """A local frame at the median of the control points, rounded; height 0 where none is known."""
-    latitude, longitude = np.median(file.lat_lon_h[:, :2], axis=0)
-    heights = file.lat_lon_h[:, 2]
-    known = heights[np.isfinite(heights)]
-    return LocalFrame(
-        latitude_deg=round(float(latitude), 5),
-        longitude_deg=round(float(longitude), 5),
-        height_m=round(float(np.median(known))) if len(known) else 0.0,
-    )
-
-
 def meet(file: ControlFile, block: Block, frame: LocalFrame) -> Control:
     """Find the block's photos for the marks; surveyed positions come out in `frame`."""
     by_name = {name.lower(): [row] for row, name in enumerate(block.names)}
