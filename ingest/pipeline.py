@@ -97,7 +97,7 @@ def ingest_photos(
     without a place; photos that are in no reconstruction are reported.
 
     Raises:
-        IngestError: the folder cannot be read, has fewer than two usable photos, or a worker died.
+        IngestError: the folder cannot be read, has fewer usable photos than a map needs, or a worker died.
         StoreError: the database cannot be written, or is of an older format.
     """
     database.require_newest_format("keep maps without a place, which an ingest may make")
@@ -107,7 +107,7 @@ def ingest_photos(
     remove_leftovers(root)
 
     scanned = _scan(folder, options, root, clock, progress)
-    photos = _with_sigmas(require_usable(scanned, folder, least=2), options)
+    photos = _with_sigmas(require_usable(scanned, folder, options.making.sfm.min_model_photos), options)
     job_id = digest(options.fingerprint, *sorted(photo.sha256 for photo in photos))[:24]
     workspace = Workspace(root=root)
     if options.stop_after == "scan":

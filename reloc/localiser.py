@@ -36,6 +36,7 @@ from reloc.wire.query import CameraUsed, InMapPose, Lineage
 _LOG = logging.getLogger(__name__)
 # Maps whose boxes come this close belong to one area: a photo may see both.
 _AREA_GAP_M = 300.0
+_NAMED = 3  # maps in quarantine that an answer names
 
 _Value = TypeVar("_Value")
 
@@ -253,7 +254,12 @@ class Localiser:
             told = replace(request, prior=None, own_position=None, beyond=None, map_ids=None)
             return in_own_frame(localise(gray, told, [area], self.options, self.snapshot, size), unplaced)
         areas = self.areas_of(request.map_ids)
-        return self._with_lineage(localise(gray, request, areas, self.options, self.snapshot, size))
+        found = localise(gray, request, areas, self.options, self.snapshot, size)
+        if found.reason == "NO_COVERAGE" and request.map_ids is None and self._provisional:
+            named = ", ".join(sorted(self._provisional)[:_NAMED])
+            detail = f"{found.detail}; maps in quarantine answer only where they are named, {named}"
+            return replace(found, detail=detail)
+        return self._with_lineage(found)
 
     def _with_lineage(self, result: LocaliseResult) -> LocaliseResult:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""

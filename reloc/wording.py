@@ -14,8 +14,8 @@ _STEEP_DEG = 60.0
 
 # What a person can do about each reason.
 ADVICE = {
-    "NO_COVERAGE": "no map lies near the prior (or the database is empty): check the prior, "
-    "or ingest photos of the place",
+    "NO_COVERAGE": "check the prior if there is one, name a map (`featuredb maps` lists them), or ingest "
+    "photos of the place",
     "TOO_FEW_FEATURES": "the photo shows too little texture: take a sharper, lighter or wider one",
     "TOO_FEW_MATCHES": "it may show another place; if not, a photo from a more similar viewpoint, "
     "a prior (--prior), or add photos of the place to the database",

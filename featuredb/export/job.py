@@ -1,6 +1,7 @@
 """What every format is given and gives back, the photos it names, and an output that is whole or absent."""
 
 import csv
+import hashlib
 import json
 import shutil
 import uuid
@@ -20,6 +21,7 @@ from featuredb.store.database import Database
 from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary
 
 ATTRIBUTION = "attribution.csv"  # goes with every export, as licences ask
+_LONGEST_NAME, _LONGEST_SUFFIX = 200, 12  # file systems take 255 bytes, and others add to a name
 _Kind = TypeVar("_Kind", FeatureMap, AnyMap)
 Told = Callable[[int, int], None]
 """Called with the number of maps written and their total."""
@@ -112,8 +114,15 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
 
 
 def folder_name(map_id: str) -> str:
-    """A map's id as the name of a folder or file: what file systems may not like is percent-encoded."""
+    """A map's id as the name of a folder or file: what file systems may not like is percent-encoded.
+
+    What would be too long for them is cut, with a digest of all of it.
+    """
     name = quote(map_id, safe=" +@,=")
+    if len(name) > _LONGEST_NAME:
+        suffix = Path(name).suffix[:_LONGEST_SUFFIX]
+        digest = hashlib.sha256(map_id.encode()).hexdigest()[:16]
+        name = f"{name[: _LONGEST_NAME - len(suffix) - len(digest) - 1]}~{digest}{suffix}"
     return name.replace(".", "%2E", 1) if name.startswith(".") else name
 
 

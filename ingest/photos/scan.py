@@ -32,6 +32,8 @@ _VERSION = 3
 # The cache is written after so many files, or a quarter of those that it has: writing it stays linear.
 _SAVE_EVERY = 200
 
+_REASONS = 3  # of skipped files that a refusal tells in full
+
 # Standard deviation of a table's position that does not say its own. Geotags of photo sites are tens of
 # metres off, where they are not wrong altogether.
 _GEOTAG_SIGMA_M = 30.0
@@ -357,7 +359,8 @@ def require_usable(result: ScanResult, folder: Path, least: int = 1) -> tuple[Ph
     usable = result.usable
     if len(usable) < least:
         reasons = ", ".join(f"{count} {code}" for code, count in sorted(result.skipped.items())) or "no files"
-        told = next((f"; {p.name}: {p.reason}" for p in result.photos if p.reason_code == "unsupported"), "")
+        first = {p.reason_code: f"; {p.name}: {p.reason}" for p in reversed(result.photos) if p.reason_code}
+        told = "".join(first[code] for code in sorted(first)[:_REASONS])
         raise IngestError(
             f"{folder}: expected at least {least} usable photos, found {len(usable)} of "
             f"{len(result.photos)} files (skipped: {reasons}{told})"

@@ -13,8 +13,9 @@ Columns (all optional but the first two, of which one must be there):
 | time    | ISO 8601, or as EXIF writes it |
 | owner, licence, title | attribution |
 
-Unknown columns are ignored and named. A row that cannot be read costs that row only. `geo.txt` of
-OpenDroneMap is such a table, too (`ingest.photos.geo_txt`).
+Commas are decimal in tables whose columns are separated by semicolons. Unknown columns are ignored and
+named. A row that cannot be read costs that row only. `geo.txt` of OpenDroneMap is such a table, too
+(`ingest.photos.geo_txt`).
 """
 
 import csv
@@ -39,6 +40,7 @@ _ALIASES = {
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "license": "licence"},
     **{"alt": "height", "altitude": "height", "elevation": "height"},
 }
+_NUMBERS = ("lat", "lon", "height", "accuracy", "accuracy_height", "yaw", "pitch", "roll")
 _PHOTO_SUFFIXES = ("", ".jpg", ".jpeg", ".png", ".heic", ".JPG", ".JPEG", ".PNG", ".HEIC")
 
 
@@ -102,7 +104,7 @@ def read_table(path: Path) -> PhotoTable:
         columns, records = _records(path)
     except (OSError, ValueError, csv.Error) as error:  # pyarrow's errors are ValueErrors or OSErrors
         raise IngestError(f"{path}: expected a table of photos, found: {error}") from error
-    names = {name: _ALIASES.get(name.strip().lower(), name.strip().lower()) for name in columns}
+    names = {name: _meant(name) for name in columns}
     if not {"path", "id"} & set(names.values()):
         raise IngestError(
             f"{path}: expected a column `path` or `id`, found {', '.join(columns) or 'no columns'}"
@@ -123,6 +125,12 @@ def read_table(path: Path) -> PhotoTable:
             rows[row.name] = row
     unknown = tuple(sorted(column for column, name in names.items() if name not in COLUMNS))
     return PhotoTable(rows=tuple(rows.values()), bad=tuple(bad), unknown_columns=unknown)
+
+
+def _meant(column: str) -> str:
+    """The column that a header's name means."""
+    name = column.strip().lower()
+    return _ALIASES.get(name, name)
 
 
 _Records = Iterator[tuple[int, "Mapping[str, Any] | str"]]
@@ -174,7 +182,11 @@ def _separated(text: str) -> tuple[list[str], _Records]:
             if len(values) != len(columns):
                 yield number, f"expected {len(columns)} values, found {len(values)}"
             else:
-                yield number, dict(zip(columns, values, strict=True))
+                yield number, {name: plain(name, value) for name, value in zip(columns, values, strict=True)}
+
+    def plain(name: str, value: str) -> str:
+        decimal = delimiter == ";" and _meant(name) in _NUMBERS
+        return value.replace(",", ".") if decimal else value
 
     return columns, rows()
 
@@ -298,6 +310,18 @@ def summary_of(table: PhotoTable) -> Sequence[str]:
     lines = []
     if table.unknown_columns:
         lines.append(f"table: columns without a meaning here are ignored: {', '.join(table.unknown_columns)}")
+    left_out = [row for row in table.rows if row.warnings]
+    if left_out:
+        words = "; ".join(one.removeprefix("table: ") for one in left_out[0].warnings)
+        lines.append(
+            f"table: values of {len(left_out)} of {len(table.rows)} rows are left out, and what the photos "
+            f"say is used; row {left_out[0].number}: {words}"
+        )
+    if table.unknown_columns and not any(row.latitude_deg is not None for row in table.rows):
+        lines.append(
+            "table: no row has a position: expected columns lat and lon in degrees; other coordinate systems "
+            "go into a geo.txt, whose first line names them"
+        )
     lines += [f"table: row {number} is left out: {reason}" for number, reason in table.bad[:20]]
     if len(table.bad) > 20:
         lines.append(f"table: {len(table.bad) - 20} more rows are left out")

@@ -77,7 +77,7 @@ def search(
     clusters = find_clusters(areas, features, request.prior, options.candidates, request.beyond)
     clock.lap("candidates")
     if not clusters:
-        return [], 0, ("NO_COVERAGE", "no map lies within reach of the prior")
+        return [], 0, ("NO_COVERAGE", _nothing_to_ask(areas, request))
     tries = [ClusterMatcher(features, cluster, options.matching) for cluster in clusters]
     candidates: list[PoseCandidate] = []
     most = 0
@@ -98,6 +98,17 @@ def search(
     if most < options.pose.min_matches:
         return [], most, ("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps")
     return [], most, ("TOO_FEW_INLIERS", f"no pose agrees with the {most} matches")
+
+
+def _nothing_to_ask(areas: Sequence[IndexedArea], request: LocaliseRequest) -> str:
+    """Why no map was asked."""
+    if not areas:
+        return "no map is active"
+    return (
+        "no map sees what the photo shows"
+        if request.prior is None
+        else "no map lies within reach of the prior"
+    )
 
 
 def most_matched(tries: list[ClusterMatcher], options: LocaliseOptions) -> list[ClusterMatcher]:

@@ -266,9 +266,10 @@ def test_a_blank_photo_has_too_few_features(area: IndexedArea) -> None:
 
 
 def test_no_maps_and_a_prior_far_away_are_no_coverage(area: IndexedArea, photo: NDArray[np.uint8]) -> None:
-    assert localise(photo, KNOWN, []).reason == "NO_COVERAGE"
-    far = replace(KNOWN, prior=prior_at(area, 5000.0))
-    assert localise(photo, far, [area]).reason == "NO_COVERAGE"
+    nothing = localise(photo, KNOWN, [])
+    assert (nothing.reason, nothing.detail) == ("NO_COVERAGE", "no map is active")
+    far = localise(photo, replace(KNOWN, prior=prior_at(area, 5000.0)), [area])
+    assert (far.reason, far.detail) == ("NO_COVERAGE", "no map lies within reach of the prior")
 
 
 def prior_at(area: IndexedArea, east_m: float) -> GeoPrior:

@@ -133,7 +133,9 @@ def test_a_map_in_quarantine_that_positions_placed_answers_where_it_is_named(
     database = Database.create(tmp_path / "db")
     database.commit_map(replace(field_map, placement=by_gps, status="quarantined"))
     localiser = Localiser.open(database)
-    assert localiser.localise(photo, KNOWN).reason == "NO_COVERAGE"
+    refused = localiser.localise(photo, KNOWN)
+    assert refused.reason == "NO_COVERAGE"
+    assert refused.detail == "no map is active; maps in quarantine answer only where they are named, field"
     named = localiser.localise(photo, replace(KNOWN, map_ids=("field",)))
     assert named.pose is not None
     assert [entry.map_id for entry in named.pose.lineage] == ["field"]

@@ -233,7 +233,7 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
         with pytest.raises(IngestError, match="expected a folder"):
             scan_folder(folder)
     result = scan_folder(tmp_path)
-    with pytest.raises(IngestError, match="1 not_an_image"):
+    with pytest.raises(IngestError, match=r"1 not_an_image; file: .+\)$"):
         require_usable(result, tmp_path)
 
 

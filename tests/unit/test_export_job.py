@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from featuredb.errors import ExportError
-from featuredb.export.job import ExportJob, size_of, whole_or_nothing
+from featuredb.export.job import ExportJob, folder_name, size_of, whole_or_nothing
 from featuredb.export.selection import Selection
 from featuredb.store import Database
 from tests.support.maps import random_map
@@ -19,6 +19,15 @@ def test_what_is_written_appears_at_the_end(tmp_path: Path) -> None:
         assert not any((tmp_path / "out").iterdir())
     assert size_of(tmp_path / "out") == 3
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_names_that_are_too_long_for_file_systems_are_cut(tmp_path: Path) -> None:
+    names = [folder_name("ド" * 80 + end) for end in (".jpg", "a.jpg")]
+    assert len(set(names)) == 2
+    for name in names:
+        assert name.endswith(".jpg")
+        (tmp_path / f"{name}.json").touch()
+    assert folder_name("é.jpg") == "%C3%A9.jpg"
 
 
 @pytest.mark.parametrize("folder", [True, False])

@@ -68,15 +68,35 @@ def test_what_is_wrong_costs_its_row_or_its_value_only(tmp_path: Path) -> None:
     rows = {r.name: r for r in table.rows}
     assert list(rows) == ["one.jpg", "two.jpg", "three.jpg", "five.jpg"]
     assert rows["one.jpg"].time == datetime(2026, 3, 1, 12)
-    assert rows["one.jpg"].latitude_deg is None
-    assert "'48,99' is no number" in rows["one.jpg"].warnings[0]
-    assert [len(r.warnings) for r in rows.values()] == [2, 3, 1, 0]
+    assert rows["one.jpg"].latitude_deg == 48.99  # columns are separated by semicolons
+    assert [len(r.warnings) for r in rows.values()] == [0, 3, 1, 0]
     assert (rows["five.jpg"].latitude_deg, rows["five.jpg"].accuracy_m) == (48.5, None)
     assert [number for number, _ in table.bad] == [3, 5, 6]
     told = "\n".join(summary_of(table))
+    assert (
+        "values of 2 of 4 rows are left out, and what the photos say is used; row 2: 95.0, 8.41 is no" in told
+    )
     assert "row 3 is left out: neither a path nor an id" in told
     assert "row 5 is left out: one.jpg is in row 1 already" in told
     assert "row 6 is left out: expected 6 values, found 3" in told
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('path,lat,lon\none.jpg,"48,99","8,41"\n', "row 1: lat '48,99' is no number"),
+        (
+            "path,easting,northing\none.jpg,456000,5420000\n",
+            "no row has a position: expected columns lat and",
+        ),
+    ],
+)
+def test_a_table_without_usable_positions_says_so(text: str, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "photos.csv"
+    path.write_text(text, encoding="utf-8")
+    table = read_table(path)
+    assert table.rows[0].latitude_deg is None
+    assert told in "\n".join(summary_of(table))
 
 
 def test_heights_and_how_good_they_are(tmp_path: Path) -> None:

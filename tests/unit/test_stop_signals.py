@@ -1,6 +1,7 @@
 """The end of a process that serves."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -25,3 +26,10 @@ def test_an_end_leaves_no_temporary_folder(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert Path(done.stdout.strip()).parent == tmp_path
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_process_that_adjusts_ends_as_others_do() -> None:
+    """pyceres comes with a handler of its own."""
+    code = "import featuredb.adjust.problem, os, signal; os.kill(os.getpid(), signal.SIGTERM)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, timeout=60.0)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, b"")
