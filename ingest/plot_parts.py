@@ -1,6 +1,7 @@
 """What the pictures of reports share: a figure as PNG, and the plan of a map with what placed it."""
 
 import io
+import warnings
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -41,9 +42,11 @@ class PlanView:
 
 
 def png_bytes(figure: "Figure") -> bytes:
-    """A figure as PNG."""
+    """A figure as PNG. Signs that the font has not are drawn as boxes, without a warning for each."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")
+        figure.savefig(buffer, format="png")
     return buffer.getvalue()
 
 

@@ -129,7 +129,7 @@ def scan_table(
             path=Path(f"row {number}"),
             status="skipped",
             reason_code="bad_row",
-            reason=f"row {number} of the table: {reason}",
+            reason=f"of the table: {reason}",
         )
         for number, reason in table.bad
     ]
