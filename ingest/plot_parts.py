@@ -1,8 +1,8 @@
 """What the pictures of reports share: a figure as PNG, and the plan of a map with what placed it."""
 
 import io
-import warnings
 import math
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
