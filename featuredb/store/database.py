@@ -114,8 +114,11 @@ class Database:
         """Make a table of CHILDREN, after those of which it names rows; harmless where they are.
 
         Raises:
+            DatabaseNotFoundError: another table than `maps`, where no database is any more.
             StoreError: the place cannot be written.
         """
+        if name != MAPS:
+            self.table(MAPS)
         for part in (*CHILDREN[name], name):
             Table.create(self.table_url(part), SPECS[part], self._storage_options)
 

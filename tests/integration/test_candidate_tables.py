@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from featuredb.errors import StoreError
+from featuredb.errors import DatabaseNotFoundError, StoreError
 from featuredb.store import Database, maintenance
 from featuredb.store import verify as verify_module
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image
@@ -59,6 +59,16 @@ def test_a_photo_that_is_not_the_one_that_was_given(database: Database) -> None:
     *_, problem = verify(database).problems
     assert problem.where == f"candidate {one}"
     assert "hashes differ" in problem.what
+
+
+def test_nothing_is_given_to_a_database_that_is_gone(database: Database) -> None:
+    """Nor is a part of one made where it was."""
+    Path(database.url).rename(f"{database.url}.moved")
+    with pytest.raises(DatabaseNotFoundError):
+        contribute(database, [contribution(1)])
+    with pytest.raises(DatabaseNotFoundError):
+        add_canary(database, "gate", b"photo", None, origin="person")
+    assert not Path(database.url).exists()
 
 
 def test_a_known_query_that_is_not_the_one_that_was_added(database: Database) -> None:

@@ -167,11 +167,14 @@ def test_a_missing_package_is_named(
     assert not Path(database.url).exists()
 
 
-def test_a_raster_of_heights_is_a_scan_of_its_cells(database: Database, tmp_path: Path) -> None:
+@pytest.mark.parametrize("nodata", [-9999.0, None])
+def test_a_raster_of_heights_is_a_scan_of_its_cells(
+    database: Database, tmp_path: Path, nodata: float | None
+) -> None:
     heights = np.add.outer(np.arange(30.0), np.arange(40.0))[:, :, None].astype(np.float32)
     heights[3:6, 7:9] = -9999.0
     place = {"epsg": 32632, "west": WEST, "north": SOUTH + 30.0, "pixel_m": 1.0}
-    write_geotiff(tmp_path / "dsm.tif", heights, **place, nodata=-9999.0)
+    write_geotiff(tmp_path / "dsm.tif", heights, **place, nodata=nodata)
     grey = np.full((30, 40, 1), 90, np.uint8)
     write_geotiff(tmp_path / "ortho.tif", grey, **place)
 

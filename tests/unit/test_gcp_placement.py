@@ -192,6 +192,7 @@ def test_another_zone_contradicts_gps(world: SurveyedBlock) -> None:
     ("off_m", "sigma_m", "told"),
     [
         ((0.0, 0.0, 20.0), (0.02, 0.02), ["GPS heights are 20."]),
+        ((0.0, 0.0, 400.0), (0.02, 0.02), ["no datum explains that"]),
         ((0.0, 0.0, -20.0), (0.02, 0.02), ["below those of the control points"]),
         ((1.5, -2.0, 0.0), (0.02, 0.02), ["GPS is 2."]),
         ((0.03, 0.0, 0.05), (0.02, 0.02), []),

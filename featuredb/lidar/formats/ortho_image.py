@@ -231,6 +231,10 @@ def is_raster(path: Path) -> bool:
         return stream.read(4) in _MAGIC
 
 
+# What programs write for "no height" in files that do not say so.
+_NO_HEIGHT = (-9999.0, -99999.0, -32767.0, -32768.0)
+
+
 def open_dsm(path: Path) -> ScanFile:
     """What a raster of heights says, its box, and how many of its cells have a height.
 
@@ -278,6 +282,7 @@ def read_dsm(path: Path, chunk_points: int) -> Iterator[RawPoints]:
             window = Window(0, top, file.width, min(rows, file.height - top))
             heights = file.read(1, window=window, masked=True).astype(np.float64)
             known = ~np.ma.getmaskarray(heights) & np.isfinite(heights.data)
+            known &= ~np.isin(heights.data, _NO_HEIGHT)
             row, column = np.nonzero(known)
             x, y = file.transform @ (column + 0.5, row + top + 0.5)
             xyz = np.stack([x, y, heights.data[known] * scale + offset], axis=1)

@@ -304,6 +304,7 @@ def _likely(adjusted: Adjusted, control: Control, row: int) -> str:
 # How far the photos' own GPS is from where control points put them, and whether that is more than noise.
 
 _TOLD = 0.001  # share of right positions of which an offset is told
+_GEOID_M = 110.0  # no height datum is further from another
 _MEDIAN = np.pi / 2.0  # variance of a median over that of a mean, normal distribution
 _SIGMA_PER_MAD = 1.4826
 
@@ -341,10 +342,20 @@ def gps_offset(
     if up**2 / spread[2, 2] > chdtri(1, _TOLD):
         notes.append(
             f"the photos' GPS heights are {abs(up):.2f} m {'above' if up > 0 else 'below'} those of the "
-            f"control points ({np.sqrt(spread[2, 2]):.2f} m are noise): they count from different datums, or "
-            "one is wrong; the control points count"
+            f"control points ({np.sqrt(spread[2, 2]):.2f} m are noise): {_why(abs(up))}; "
+            "the control points count"
         )
     return figures, notes
+
+
+def _why(apart_m: float) -> str:
+    """What heights so far apart may mean."""
+    if apart_m < _GEOID_M:
+        return "they count from different datums, or one is wrong"
+    return (
+        "no datum explains that: the survey's heights may be in another unit (feet), or the photos' may count "
+        "from the take-off"
+    )
 
 
 def _middle(off: FloatArray) -> tuple[float, float]:
