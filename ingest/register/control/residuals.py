@@ -353,7 +353,7 @@ def _why(apart_m: float) -> str:
     if apart_m < _GEOID_M:
         return "they count from different datums, or one is wrong"
     return (
-        "no datum explains that: the survey's heights may be in another unit (feet), or the photos' may count "
+        "no datum explains that: the survey's heights may be in another unit (feet), or the photos' count "
         "from the take-off"
     )
 
