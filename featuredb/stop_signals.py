@@ -1,4 +1,4 @@
-"""What a command that serves does when it is told to stop."""
+"""What a process does when it is told to stop."""
 
 import logging
 import multiprocessing
@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import NoReturn
@@ -21,6 +22,12 @@ def on_stop_signals(stop: Callable[[], object]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def handle_as_before() -> None:
+    """SIGTERM is answered as Python knows it, whatever a native library has put in place of that."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
 
 def end_process(code: int) -> NoReturn:

@@ -1,8 +1,6 @@
 """A block and its terms as COLMAP's bundle adjustment, to whose Ceres problem pyceres adds the terms."""
 
 import logging
-import signal
-import threading
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -36,11 +34,10 @@ from featuredb.adjust.terms import (
 )
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.stop_signals import handle_as_before
 
 _LOG = logging.getLogger(__name__)
-if threading.current_thread() is threading.main_thread():
-    # pyceres has put a handler there that prints a stack trace; a process that is to end ends as before.
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+handle_as_before()  # pyceres has put a handler there that prints a stack trace
 _MAX_RADIUS = 1e10  # of Levenberg-Marquardt; without any damping what nothing determines is singular
 _LETS_GO = 2.0  # sigmas beyond which a lens prior loses to photos that know: EXIF of a cropped photo
 _ANYWHERE = 1e6  # units of the block: sigma of a position of which nothing is known
