@@ -57,13 +57,13 @@ class LocalFrame:
 
     @classmethod
     def about(cls, lat_lon_h: FloatArray) -> Self:
-        """The frame at about this place (3,), whose origin does not depend on the last digits."""
+        """The frame at about this place (3,): degrees, degrees, metres; its origin is rounded to metres."""
         latitude, longitude, height = lat_lon_h.tolist()
         return cls(latitude_deg=round(latitude, 5), longitude_deg=round(longitude, 5), height_m=round(height))
 
     @classmethod
     def amid(cls, lat_lon_h: FloatArray) -> Self:
-        """The frame at about the median of places (n, 3), n > 0; heights that are NaN do not count."""
+        """The frame at about the median of places (n, 3), n > 0: degrees, degrees, metres or NaN."""
         latitudes, longitudes, heights = lat_lon_h.T
         # From about the middle: beside the meridian of 180 degrees longitudes jump.
         turns = np.exp(1j * np.radians(longitudes))
