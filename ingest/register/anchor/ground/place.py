@@ -32,12 +32,13 @@ _RIVAL_RATE = 1e-3  # how often another place that is as good would agree in so 
 _AGREE_M, _NEAR_M = 0.3, 1.0  # of a point from the solid: across its plane, and from what is known of it
 _ABOVE_M = 1.0  # over the ground: the ground agrees everywhere
 _PLACE_M = 3.0  # side of what counts as one place: what lies closer together errs together
-_EYE_M = 1.6  # of people over the ground, from which a fit starts
-_LOWEST_M, _HIGHEST_M = 0.5, 3.0  # and where a fit may leave the median of them
+_EYE_M, _EYE_SIGMA_M = 1.6, 0.3  # of people over the ground as a scan has it, in the median
+_LOWEST_M, _HIGHEST_M = 0.5, 3.0  # and where a fit may leave it
+_THROUGH = 0.5  # of the views go through buildings: nobody stands there
 _NEAREST_M, _FURTHEST_M = 3.0, 100.0  # medians from which people take photos of fronts
 _COARSE, _ASKED, _FINE = 400, 1500, 4000  # points of a fit, of a place's evidence, of the last fit
 _COARSE_WIDTHS_M = (2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5)
-_FINE_WIDTHS_M = (1.5, 1.0, 0.7, 0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3)
+_FINE_WIDTHS_M = (1.5, 1.0, 0.7, 0.5, 0.5, 0.3, 0.3, 0.2, 0.2, 0.15, 0.15, 0.15)
 _START_SIGMA = (0.1, 0.03, 0.03, 0.1)  # of size and angles of a start
 _AGAIN_M, _AGAIN_SIZE = 2.0, 0.05  # from so far around the best place it is fitted again
 _AROUND_M = 100.0  # of the geotags' middle: what people see from where they may be
@@ -52,7 +53,8 @@ _LEAST_TRIES = 20  # elsewhere: fewer do not tell what chance gives
 _LIKE_SIZE = 0.5  # logarithm: sizes at which chance is alike; of a smaller map more agrees anywhere
 _TAIL = 0.25  # share of the places elsewhere whose scores are taken for the tail of what chance gives
 _TOGETHER = 2.5  # mean of such a tail, at least: the median of eight searches without a right place was 2.4
-_WALL_SIGMA_M = 0.15  # of all outlines together, outwards: eaves, and a laser's footprint
+# Information of no eaves, over that of all points: 0.15 m, where a hundred points, of 0.1 m, err together.
+_EAVES = 5e-3
 _LEAST_SIGMA_M = 0.05  # of a point
 
 GroundReason = Literal[
@@ -135,13 +137,20 @@ def _tried(plan: StreetPlan, shape: ScanShape, search: PlanSearch, tags: Geotags
     found = search.tries(plan, sizes.tolist(), turns.tolist(), tags)
     fits = [_fitted(plan, shape, _start(plan, shape, one), rows, _COARSE_WIDTHS_M) for one in found]
     asked = np.random.default_rng(0).permutation(len(plan.points))[:_ASKED]
-    return [_asked(shape, laid(shape, plan.points[asked], fit.local_from_own)) for fit in fits]
+    return [_asked(shape, laid(shape, plan.points[asked], fit.local_from_own, fit.eaves_m)) for fit in fits]
 
 
 def _eyes_m(centers: FloatArray, shape: ScanShape, sim: Sim3) -> float:
     """How high over the ground cameras (n, 3) are, in the median."""
     placed = sim.act(centers)
     return float(np.median(placed[:, 2] - shape.ground[shape.cells(placed[:, :2])]))
+
+
+def _through(plan: StreetPlan, shape: ScanShape, sim: Sim3) -> float:
+    """Share of the views that would go through buildings."""
+    level = np.zeros((len(plan.free), 1))
+    ends = (sim.act(np.hstack([plan.free[:, part], level]))[:, :2] for part in (slice(2), slice(2, 4)))
+    return shape.through(np.hstack([*ends]))
 
 
 def _chance(there: Sequence[_Tried]) -> FloatArray:
@@ -172,8 +181,8 @@ def _start(plan: StreetPlan, shape: ScanShape, one: PlanTry) -> Sim3:
 def _fitted(
     plan: StreetPlan, shape: ScanShape, start: Sim3, rows: NDArray[np.int64], widths: tuple[float, ...]
 ) -> SolidFit:
-    information = np.diag([*(len(rows) * 0.1 / np.square(_START_SIGMA)), 1e-3, 1e-3, 1e-3])
-    return fitted(shape, plan.points[rows], start, information, widths)
+    known = [*(len(rows) * 0.1 / np.square(_START_SIGMA)), 1e-3, 1e-3, 1e-3, _EAVES * len(rows)]
+    return fitted(shape, plan.points[rows], start, np.diag(known), widths)
 
 
 def _asked(shape: ScanShape, fit: SolidFit) -> _Tried:
@@ -195,12 +204,14 @@ def _judged(
     """The photos that lie there, fitted, and whether another place explains them as well."""
     chance = _chance(there)
     eyes_m = np.array([_eyes_m(plan.centers, shape, one.fit.local_from_own) for one in there])
-    stands = np.flatnonzero((eyes_m > _LOWEST_M) & (eyes_m < _HIGHEST_M))
+    seen = np.array([_through(plan, shape, one.fit.local_from_own) for one in there]) < _THROUGH
+    stands = np.flatnonzero((eyes_m > _LOWEST_M) & (eyes_m < _HIGHEST_M) & seen)
     if not len(stands):
-        words = "nowhere would its cameras be as high as people hold them"
+        words = "nowhere would its cameras be as high as people hold them, and see what they show"
         return GroundPlace(reason="STRUCTURE", message=words)
     there, chance = [there[k] for k in stands.tolist()], chance[stands]
     scores = np.array([_score(one, share) for one, share in zip(there, chance, strict=True)])
+    scores -= 0.5 * np.square((eyes_m[stands] - _EYE_M) / _EYE_SIGMA_M)
     if tags is not None:
         scores += [tags.log_likelihood(one.fit.local_from_own.act(plan.centers)[:, :2]) for one in there]
     first = int(scores.argmax())
@@ -221,7 +232,7 @@ def _judged(
     away = np.array([float(np.median(np.linalg.norm(off, axis=1))) for off in there_m])
     log_nfa = _log_nfa(scores[first], scores[away > _ELSEWHERE_M]) - float(np.log10(tests))
     apart = [one for one, far in zip(there, away, strict=True) if far > _APART_M]
-    rival = _best_rival(plan, shape, rows, sim, apart, rate)
+    rival = _best_rival(plan, shape, rows, final.fit, apart, rate)
     figures = {"photos": int(kept.sum()), "of": len(kept), "rate": rate, "log_nfa": log_nfa, "rival": rival}
     words = (
         f"{int(kept.sum())} of {len(kept)} photos lie on the scan's outlines: "
@@ -257,7 +268,7 @@ def _settled(
             break
         final = _asked(shape, _fitted(plan, shape, sim, rows, _FINE_WIDTHS_M))
         sim = final.fit.local_from_own
-        kept = _lie_there(unplaced, plan, shape, sim, rate)
+        kept = _lie_there(unplaced, plan, shape, final.fit, rate)
     return final, kept
 
 
@@ -302,10 +313,10 @@ def _rows_seen(unplaced: UnplacedMap, plan: StreetPlan, kept: NDArray[np.bool_])
 
 
 def _lie_there(
-    unplaced: UnplacedMap, plan: StreetPlan, shape: ScanShape, sim: Sim3, rate: float
+    unplaced: UnplacedMap, plan: StreetPlan, shape: ScanShape, fit: SolidFit, rate: float
 ) -> NDArray[np.bool_]:
-    """Which photos lie where the similarity puts them: their points agree, and others that stay see them."""
-    asked = _asked(shape, laid(shape, plan.points, sim))
+    """Which photos lie where the fit puts them: their points agree, and others that stay see them."""
+    asked = _asked(shape, laid(shape, plan.points, fit.local_from_own, fit.eaves_m))
     point_of = np.full(len(unplaced.points.xyz), -1)
     point_of[plan.rows] = np.arange(len(plan.rows))
     observations = unplaced.observations
@@ -333,21 +344,26 @@ def _best_rival(
     plan: StreetPlan,
     shape: ScanShape,
     rows: NDArray[np.int64],
-    sim: Sim3,
+    fit: SolidFit,
     apart: Sequence[_Tried],
     rate: float,
 ) -> float:
-    """`_rival_p` of the best of the places apart from `sim` that are of about its size; 0 without any."""
-    sized = [one for one in apart if abs(np.log(one.fit.local_from_own.scale / sim.scale)) < _ALIKE]
+    """`_rival_p` of the best of the places apart from a fit that are of about its size; 0 without any."""
+    size = fit.local_from_own.scale
+    sized = [one for one in apart if abs(np.log(one.fit.local_from_own.scale / size)) < _ALIKE]
     best = sorted(sized, key=lambda one: _score(one, rate))[-_RIVALS:]
-    return max((_rival_p(plan, shape, rows, sim, one.fit.local_from_own) for one in best), default=0.0)
+    return max((_rival_p(plan, shape, rows, fit, one.fit) for one in best), default=0.0)
 
 
-def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: Sim3, other: Sim3) -> float:
+def _rival_p(
+    plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], fit: SolidFit, other: SolidFit
+) -> float:
     """How often a place as good as another would agree in so many more blocks of the map."""
-    own, rival = (_asked(shape, laid(shape, plan.points[rows], of)) for of in (sim, other))
+    own, rival = (
+        _asked(shape, laid(shape, plan.points[rows], of.local_from_own, of.eaves_m)) for of in (fit, other)
+    )
     counted = own.above
-    block = np.floor(sim.act(plan.points[rows[counted]]) / _PLACE_M).astype(np.int64)
+    block = np.floor(own.fit.placed[counted] / _PLACE_M).astype(np.int64)
     group = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
     more = np.bincount(group, own.agrees[counted]) - np.bincount(group, (rival.agrees & rival.above)[counted])
     size = np.bincount(group)
@@ -356,13 +372,12 @@ def _rival_p(plan: StreetPlan, shape: ScanShape, rows: NDArray[np.int64], sim: S
 
 
 def _covariance(final: _Tried) -> tuple[FloatArray, float]:
-    """(7, 7) of the left perturbation: neighbours err together, outlines by one offset, all within a cell."""
+    """(7, 7) of the left perturbation: neighbours err together, all within a cell."""
     fit, agrees = final.fit, final.agrees
     rms_m = float(np.sqrt(np.mean(np.square(fit.off_m[agrees])))) if agrees.any() else _AGREE_M
     blocks = len(np.unique(np.floor(fit.placed[agrees] / _PLACE_M).astype(np.int64), axis=0))
     factor = max(1.0, np.count_nonzero(agrees) / max(blocks, 1))
-    inverse = np.linalg.inv(fit.normal + np.diag([1e-6] * 7))
-    offset = inverse @ fit.by_walls * _WALL_SIGMA_M
-    covariance = factor * max(rms_m, _LEAST_SIGMA_M) ** 2 * inverse + np.outer(offset, offset)
+    inverse = np.linalg.inv(fit.normal + np.diag([1e-6] * 7 + [_EAVES * len(fit.placed)]))[:7, :7]
+    covariance = factor * max(rms_m, _LEAST_SIGMA_M) ** 2 * inverse
     covariance[4:, 4:] += np.eye(3) * CELL_M**2 / 12.0
     return Sim3.shift(fit.middle).carried(covariance), rms_m

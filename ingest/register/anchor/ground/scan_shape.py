@@ -7,12 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, grey_opening, median_filter, minimum_filter
+from scipy.ndimage import (
+    binary_erosion,
+    distance_transform_edt,
+    gaussian_filter,
+    grey_opening,
+    median_filter,
+    minimum_filter,
+)
 from scipy.spatial import cKDTree
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.render.cloud import PointCloud
+from ingest.register.anchor.ground.facades import on_lines
 
 Circle = tuple[float, float, float]  # x, y, radius
 
@@ -20,9 +28,8 @@ CELL_M = 0.5
 _VEGETATION = (3, 4, 5)  # ASPRS: crowns are no fronts, and people stand under them
 _WIDEST_M = 30.0  # of a building across: ground is what is left of heights that are narrower
 _JUMP_M = 2.0  # between cells, of a wall
+_HIGH_M, _RAY_STEPS = 2.5, 60  # over the ground: nobody looks through it
 _STEP_M = 0.5  # between points of a wall
-_WALL_REACH_M, _LEAST_WALL = 1.5, 3  # neighbours that give a wall its line
-_LAST = 4  # points of a roof that tell where it ends
 _SMOOTH_CELLS = 1.5  # of the heights whose gradient says where a wall looks
 _SLOPE_CELLS = 0.7  # of the heights whose gradient is a surface's normal
 _FLAT_M = 0.5  # between cells of one surface
@@ -39,6 +46,7 @@ class ScanShape:
     Attributes:
         corner: (2,) metres, in the cloud's frame.
         ground, top: (h, w) heights, metres. known: (h, w), where the scan has points near.
+        built: (h, w), what nobody looks through: no border of a building.
         points, normals: (n, 3) of ground, roofs and walls. tree: of the points.
         walls: (k, 4) of wall cells: x, y, and the way out of the wall.
     """
@@ -47,6 +55,7 @@ class ScanShape:
     ground: FloatArray
     top: FloatArray
     known: NDArray[np.bool_]
+    built: NDArray[np.bool_]
     points: FloatArray
     normals: FloatArray
     tree: cKDTree
@@ -62,6 +71,13 @@ class ScanShape:
         at = (xy - self.corner) / CELL_M
         there = ((at >= 0) & (at < np.array(self.top.shape[::-1]))).all(axis=1)
         return np.asarray(there & self.known[self.cells(xy)])
+
+    def through(self, rays: FloatArray) -> float:
+        """Share of rays (r, 4), from x, y to x, y, that go through buildings."""
+        along = np.linspace(0.0, 1.0, _RAY_STEPS)[:, None, None]
+        at = rays[:, :2] + along * (rays[:, 2:] - rays[:, :2])
+        inside = self.built[self.cells(at.reshape(-1, 2))].reshape(_RAY_STEPS, -1)
+        return float(inside.any(axis=0).mean())
 
 
 def shape_of(cloud: PointCloud, circle: Circle | None) -> ScanShape | None:
@@ -94,6 +110,7 @@ def shape_of(cloud: PointCloud, circle: Circle | None) -> ScanShape | None:
         ground=ground,
         top=top,
         known=known,
+        built=binary_erosion((top - ground > _HIGH_M) & known),
         points=points,
         normals=np.vstack([surface_normals, upright_normals]),
         tree=cKDTree(points),
@@ -147,48 +164,7 @@ def _walls(top: FloatArray, known: NDArray[np.bool_], corner: FloatArray, xyz: F
         found.append(np.column_stack([corner + middle * CELL_M, out, heights]))
     walls = np.vstack(found)
     walls[:, 2:4] /= np.maximum(np.linalg.norm(walls[:, 2:4], axis=1, keepdims=True), 1e-9)
-    return _straightened(walls, xyz)
-
-
-def _straightened(walls: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Walls on the lines through their neighbours, cells make stairs of them, as far out as the roof goes."""
-    if not len(walls):
-        return walls
-    tree = cKDTree(walls[:, :2])
-    around = cKDTree(xyz[:, :2]).query_ball_point(walls[:, :2], _WALL_REACH_M)
-    kept, result = [], walls.copy()
-    for k, near in enumerate(tree.query_ball_point(walls[:, :2], _WALL_REACH_M)):
-        rows = np.array(near)
-        rows = rows[walls[rows, 2:4] @ walls[k, 2:4] > 0.8]
-        if len(rows) < _LEAST_WALL:
-            continue
-        patch = walls[rows, :2]
-        middle = patch.mean(axis=0)
-        normal = np.linalg.eigh((patch - middle).T @ (patch - middle))[1][:, 0]
-        normal *= np.sign(normal @ walls[k, 2:4]) or 1.0
-        if normal @ walls[k, 2:4] < 0.8:
-            continue
-        near_by = xyz[around[k]]
-        out = (near_by[:, :2] - middle) @ normal
-        edge = _edge(out[near_by[:, 2] > 0.5 * (walls[k, 4] + walls[k, 5])])
-        if edge is None:
-            continue
-        result[k, :2] = walls[k, :2] - normal * (normal @ (walls[k, :2] - middle) - edge)
-        result[k, 2:4] = normal
-        kept.append(k)
-    return result[kept]
-
-
-def _edge(out: FloatArray) -> float | None:
-    """Where a roof ends by how far out (n,) its points lie: past the last ones by their mean distance.
-
-    The very last one may be a bird.
-    """
-    if len(out) < 2 * _LAST:
-        return None
-    last = np.sort(out)[-_LAST:-1]
-    apart = float(np.median(last) - np.median(out)) / (0.5 * len(out))
-    return float(last.mean() + apart * (0.5 * _LAST + 0.5))
+    return on_lines(walls, xyz)
 
 
 def _standing(walls: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -206,23 +182,26 @@ class SolidFit:
 
     Attributes:
         local_from_own: similarity. placed: (n, 3) the points there. middle: (3,) of them.
+        eaves_m: by how much the solid's walls lie outside of the fronts.
         off_m: (n,) distances of the points from the solid's planes. near_m: (n,) from its nearest point;
             infinite where none is within reach.
-        normal, right: (7, 7) and (7,) equations of the left perturbation about `middle` that lessens
-            `off_m`. by_walls: (7,) what a metre of all walls outwards adds to the right side.
+        normal, right: (8, 8) and (8,) equations of the step that lessens `off_m`: of the left perturbation
+            about `middle`, and of `eaves_m`.
     """
 
     local_from_own: Sim3
+    eaves_m: float
     placed: FloatArray
     middle: FloatArray
     off_m: FloatArray
     near_m: FloatArray
     normal: FloatArray
     right: FloatArray
-    by_walls: FloatArray
 
 
-def laid(shape: ScanShape, own: FloatArray, local_from_own: Sim3, width_m: float = _FINE_M) -> SolidFit:
+def laid(
+    shape: ScanShape, own: FloatArray, local_from_own: Sim3, eaves_m: float = 0.0, width_m: float = _FINE_M
+) -> SolidFit:
     """How points (n, 3) of a map lie on a scan's solid; `width_m` of the loss by which they are weighed."""
     placed = local_from_own.act(own)
     middle = placed.mean(axis=0)
@@ -230,37 +209,40 @@ def laid(shape: ScanShape, own: FloatArray, local_from_own: Sim3, width_m: float
     near_m, index = (np.asarray(found) for found in shape.tree.query(placed, distance_upper_bound=reach_m))
     index = np.where(np.isfinite(near_m), index, 0)  # of points that nothing is near, which count for nothing
     normals = shape.normals[index]
-    off_m = np.einsum("ij,ij->i", normals, placed - shape.points[index])
+    stands = np.abs(normals[:, 2]) < _UPRIGHT
+    off_m = np.einsum("ij,ij->i", normals, placed - shape.points[index]) + eaves_m * stands
     weight = 1.0 / (1.0 + np.square(off_m / width_m)) ** 2
     weight = np.where(np.isfinite(near_m), weight, 0.0)
-    jacobian = np.einsum("ij,ijk->ik", normals, point_jacobian(placed - middle))
+    by_place = np.einsum("ij,ijk->ik", normals, point_jacobian(placed - middle))
+    jacobian = np.column_stack([by_place, stands])
     return SolidFit(
         local_from_own=local_from_own,
+        eaves_m=eaves_m,
         placed=placed,
         middle=middle,
         off_m=off_m,
         near_m=near_m,
         normal=jacobian.T @ (jacobian * weight[:, None]),
         right=-jacobian.T @ (weight * off_m),
-        by_walls=jacobian.T @ (weight * (np.abs(normals[:, 2]) < _UPRIGHT)),
     )
 
 
 def fitted(
     shape: ScanShape, own: FloatArray, start: Sim3, prior: FloatArray, widths_m: tuple[float, ...]
 ) -> SolidFit:
-    """The similarity that lays points (n, 3) of a map on a scan's solid.
+    """The similarity, and the eaves, that lay points (n, 3) of a map on a scan's solid.
 
     Args:
-        prior: (7, 7) information of the start, left perturbation about the middle of the points.
+        prior: (8, 8) information of the start, left perturbation about the middle of the points, and of no
+            eaves at all.
         widths_m: of the loss, round by round; the last one until the similarity settles.
     """
-    sim = start
+    sim, eaves_m = start, 0.0
     for k in range(len(widths_m) + _FINE_ROUNDS):
-        fit = laid(shape, own, sim, widths_m[min(k, len(widths_m) - 1)])
-        step = np.linalg.solve(fit.normal + prior, fit.right)
+        fit = laid(shape, own, sim, eaves_m, widths_m[min(k, len(widths_m) - 1)])
+        step = np.linalg.solve(fit.normal + prior, fit.right - prior[:, 7] * eaves_m)
         step[:4] = np.clip(step[:4], -_MOST_TURN, _MOST_TURN)
-        sim = Sim3.exp(step).about(fit.middle) @ sim
+        sim, eaves_m = Sim3.exp(step[:7]).about(fit.middle) @ sim, eaves_m + float(step[7])
         if k >= len(widths_m) and float(np.abs(step).max()) < _SETTLED:
             break
-    return laid(shape, own, sim, widths_m[-1])
+    return laid(shape, own, sim, eaves_m, widths_m[-1])

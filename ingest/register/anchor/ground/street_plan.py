@@ -92,11 +92,14 @@ def street_plan(unplaced: UnplacedMap) -> StreetPlan | None:
 
 
 def _level(unplaced: UnplacedMap) -> FloatArray:
-    """Rotation (3, 3) of the own frame until z is about up: people hold one side of a photo level."""
+    """Rotation (3, 3) of the own frame until z is about up: people hold one side of a photo level.
+
+    And most hold it upright, which tells up from down.
+    """
     if unplaced.frame.upright:
         return np.eye(3)
     axes = np.array([image.cam_from_local.rotation[:2] for image in unplaced.images])  # right and down
-    ways = np.concatenate([-axes[:, 1], axes[:, 0], -axes[:, 0]])
+    ways = np.concatenate([axes[:, 1], axes[:, 0]])
     rises = np.abs(ways @ axes.transpose(0, 2, 1)) + np.array([0.0, _ON_EDGE])
     off = np.minimum(rises, _LEVEL).min(axis=2).sum(axis=0)
     up = ways[int(off.argmin())]
@@ -107,8 +110,8 @@ def _level(unplaced: UnplacedMap) -> FloatArray:
             break
         against = _PRIOR * (np.eye(3) - np.outer(up, up)) * len(level)
         steady = np.linalg.eigh(level.T @ level + against)[1][:, 0]
-        up = steady * np.sign(steady @ up)
-    return rotation_to_up(up)
+        up = steady
+    return rotation_to_up(-up if float((axes[:, 1] @ up).sum()) > 0 else up)
 
 
 def _planes(xyz: FloatArray, eye: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
