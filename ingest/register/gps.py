@@ -35,6 +35,9 @@ _ANSWERS = 0.001  # chance below which a map may answer
 # Standard deviations of scale and turn beyond which covariances say nothing, as they are linear.
 _MAX_SCALE_SIGMA, _MAX_TURN_DEG = 0.3, 25.0
 _ANSWERS_TURN_DEG = 10.0  # standard deviation of the turn beyond which a map may not answer
+_LEANS_DEG = (
+    30.0  # photos that are level with each other, off the level in the median: no one's and no gimbal's
+)
 _MAX_SAMPLES = 500  # of three positions; fewer photos are tried exhaustively
 _PLAIN_M = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 
@@ -108,7 +111,8 @@ def place_by_gps(
 def _angles(fit: NoisyFit, held: Held) -> dict[str, Any]:
     """How far off photos are held from what they say, or from level, at the median."""
     off = held.terms(fit.local_from_sfm.rotation)[2]
-    result: dict[str, Any] = {"told": held.told}
+    down = float((fit.local_from_sfm.rotation @ held.down)[2])
+    result: dict[str, Any] = {"told": held.told, "upside_down": down > 0}
     for name, rows in (("tilt", ~held.by_yaw), ("yaw", held.by_yaw)):
         if rows.any():
             result |= {
@@ -203,6 +207,12 @@ def _judged(
         provisional = (
             f"the photos lie along a line: their GPS tells the turn about it to {checked_deg:.0f} degrees, "
             f"{_ANSWERS_TURN_DEG:.0f} are needed, and no camera angles do"
+        )
+    angles = figures.get("angles", {})
+    if angles.get("upside_down") or angles.get("tilt_off_deg", 0.0) > _LEANS_DEG:
+        provisional = (
+            "the positions lay the photos on their sides or upside down: latitude and longitude may be "
+            "exchanged, or pictures stored rotated"
         )
     message = "placed by GPS" if provisional else _words("placed by GPS", figures)
     return outcome(reason=None, message=message, provisional=provisional)

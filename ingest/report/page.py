@@ -46,6 +46,7 @@ FIGURES = {
     "log10_chance": "how often positions of other photos would fit as well, as a power of ten",
     "told": "whether photos tell their own angles; if not, they are taken to be held level",
     "tilt_off_deg": "median angle in the map between photos and what they tell, or level",
+    "upside_down": "whether the positions lay the photos upside down",
     "tilt_contradicts": "whether that is more than such angles are ever wrong by",
     "yaw_off_deg": "median angle in the map between the photos' compass or gimbal and north",
     "yaw_contradicts": "whether that is more than such angles are ever wrong by",

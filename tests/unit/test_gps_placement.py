@@ -256,8 +256,19 @@ def test_tilts_off_by_180_degrees_turn_no_flight_over() -> None:
     held, told = _told(positions, off_deg=180.0)
     placed = _placed_by(positions, held_of(held, told))
     assert placed.reason is None
-    assert "tilt by 1" in placed.message
+    assert "upside down" in placed.provisional
     assert _turn_deg(placed) < 3.0
+
+
+@pytest.mark.parametrize("pitch_deg", [-80.0, -20.0])
+def test_latitudes_and_longitudes_that_are_exchanged_let_no_map_answer(pitch_deg: float) -> None:
+    positions = flight(20)
+    held, _ = _told(positions, pitch_deg=pitch_deg)
+    sigmas = np.tile([4.0, 4.0, 10.0], (20, 1))
+    for order, waits in (([0, 1, 2], False), ([1, 0, 2], True)):
+        placed = place_by_gps(TRUE.inverse().act(positions), positions[:, order], sigmas, held=held_of(held))
+        assert placed.reason is None
+        assert ("exchanged" in placed.provisional) == waits
 
 
 def test_a_third_of_yaws_off_by_180_degrees_drags_nothing() -> None:
