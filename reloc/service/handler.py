@@ -39,6 +39,8 @@ from reloc.wire.query import (
     bad_request,
 )
 
+_LEAST_FOCAL = 0.1  # of the longer side, as COLMAP's: 157 degrees; fisheyes of 360 degrees have 0.16
+
 
 def answer_query(
     wire_request: LocaliseWireRequest,  # without a request id it gets one
@@ -116,10 +118,18 @@ def query_camera(camera: CameraRequest, width: int, height: int) -> Camera:
     """The camera that a message speaks of, for pictures of this size.
 
     Raises:
-        RequestError: BAD_REQUEST, it is none, or of another shape.
+        RequestError: BAD_REQUEST, it is none, of another shape, or as wide as no lens.
     """
     try:
-        return camera_of(camera).scaled_to(width, height)
+        found = camera_of(camera)
+        least_px = _LEAST_FOCAL * max(found.width, found.height)
+        if found.focal_px < least_px:
+            raise InvalidValueError(
+                f"expected a focal length in pixels, {least_px:.0f} and more in a picture of {found.width} x "
+                f"{found.height}, found {found.focal_px:g}; is it in millimetres? Pixels are these times the "
+                "picture's width over the sensor's"
+            )
+        return found.scaled_to(width, height)
     except InvalidValueError as error:
         raise bad_request(f"camera: {error}") from error
 

@@ -142,6 +142,10 @@ def test_paths_and_methods_that_there_are_not(gateway):
     [
         ({"camera": "{"}, "camera"),
         ({"camera": '{"model": "PINHOLE", "width": 1, "height": 1, "params": [1]}'}, "camera: params"),
+        (
+            {"camera": '{"model": "PINHOLE", "width": 9, "height": 9, "params": [0.8, 0.8, 4, 4]}'},
+            "millimetres",
+        ),
         ({"prior": '{"lat": 100, "lon": 0, "sigma_m": 5}'}, "prior: lat"),
         ({"prior": '{"lat": 10, "lon": 0, "sigma": 5}'}, "prior: sigma"),
         ({"options": '{"inlier": true}'}, "options: inlier"),
