@@ -193,6 +193,10 @@ def test_files_of_picks(tmp_path: Path) -> None:
     assert (first.image, second.image) == ("b.jpg", "a.jpg")
     np.testing.assert_array_equal(first.pixels, [[4, 5]])
     np.testing.assert_array_equal(second.utm, [[6, 7, 8]])
+    for text in ("1,5;2;3;4,25;5", "1,5\t2\t3\t4,25\t5", "1.5 2  3 4.25 5"):
+        path.write_text(text, encoding="utf-16")
+        (picks,) = read_picks(path, "a.jpg")
+        np.testing.assert_array_equal(np.hstack([picks.pixels, picks.utm]), [[1.5, 2, 3, 4.25, 5]])
 
 
 @pytest.mark.parametrize(
