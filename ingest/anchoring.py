@@ -33,6 +33,7 @@ from ingest.register.anchor.start.first_place import (
     MARGIN_M,
     FirstPlace,
     StartFiles,
+    check_on_scan,
     first_place,
     plan_box,
     started_images,
@@ -328,6 +329,7 @@ def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
         starts, notes = dict(job.first.starts), list(job.first.notes)
     else:
         told = request.start.read()
+        check_on_scan(told, job.cloud, feature_map.epsg)
         found = started_images(feature_map, told, feature_map.frame, feature_map.epsg)
         starts = {f.image.image_id: f.prior for f in found}
         notes = [f.note for f in found]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from featuredb.errors import ImageError, InvalidValueError
+from featuredb.features.decode import read_image_bytes
 from featuredb.features.shrink import shrunk
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -126,7 +127,7 @@ class PhotoAsker:
         """Where was this photo taken?
 
         Raises:
-            ImageError, OSError: no usable image. InvalidValueError: a prior or camera that is none.
+            ImageError: no usable image. InvalidValueError: a prior or camera that is none.
             RequestError: an image, a camera or maps that do not fit. StoreError: the database is gone.
         """
         photo, called = _image_bytes(image)
@@ -157,12 +158,13 @@ def _image_bytes(image: Image) -> tuple[bytes, str]:
     if isinstance(image, bytes):
         return image, "photo"
     if isinstance(image, str | Path):
-        return Path(image).read_bytes(), str(image)
+        return read_image_bytes(Path(image)), str(image)
     pixels = np.asarray(image)
     is_picture = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
     if pixels.dtype != np.uint8 or not pixels.size or not is_picture:
         raise ImageError(
-            f"image: expected pixels (h, w) or (h, w, 3) uint8, found {pixels.shape} {pixels.dtype}"
+            "image: expected a path, bytes, or pixels (h, w) or (h, w, 3) uint8, found an array of "
+            f"{pixels.shape} {pixels.dtype}"
         )
     stored = pixels if pixels.ndim == 2 else pixels[:, :, ::-1]
     return cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes(), "photo"

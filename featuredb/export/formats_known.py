@@ -119,6 +119,8 @@ def export_maps(
     chosen = FORMATS.get(name)
     if chosen is None:
         raise ExportError(f"format: expected one of {', '.join(FORMATS)}, found {name!r}")
+    if unknown := options.keys() - OWN_OPTIONS.keys():
+        raise ExportError(f"export: expected options {', '.join(OWN_OPTIONS)}, found {', '.join(unknown)}")
     for option, value in options.items():
         if value != OWN_OPTIONS[option] and option not in chosen.options:
             wanted = " or ".join(n for n, entry in FORMATS.items() if option in entry.options)

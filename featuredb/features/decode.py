@@ -2,7 +2,8 @@
 
 Pixels come as stored: EXIF orientation is not applied, so that features, cameras and poses of a photo
 belong to the same pixels whichever program reads it. Grey is OpenCV's own: the luma of a JPEG as
-coded, 0.299 R + 0.587 G + 0.114 B for the others. Transparency is dropped, 16 bits keep their upper 8.
+coded, 0.299 R + 0.587 G + 0.114 B for the others. Transparency is dropped. 16 bits keep the upper 8 of
+those that the picture uses, since cameras of 10 to 14 bits store dark ones.
 
 A file is checked before anything is allocated for its pixels: kind, size, limits and completeness.
 """
@@ -161,6 +162,11 @@ def _check(data: bytes, limits: DecodeLimits) -> ImageHeader:
 def _decode(content: bytes, header: ImageHeader, flags: int, by: int = 1) -> NDArray[np.uint8]:
     """Pixels by OpenCV's flags, which make the picture smaller by this divisor."""
     pixels = _heic(content, header, flags) if header.format == "HEIC" else _imdecode(content, flags)
+    if header.format in ("PNG", "TIFF") and pixels is not None and pixels.max() < 128:
+        # By IMREAD_COLOR_RGB, OpenCV leaves the pixels of such a TIFF as they were in memory.
+        deep = _imdecode(content, (flags and cv2.IMREAD_COLOR) | cv2.IMREAD_ANYDEPTH)
+        if deep is not None:
+            pixels = np.ascontiguousarray(deep[:, :, ::-1]) if flags else deep
     if pixels is None:
         raise ImageError(f"the {header.format} of {header.width}x{header.height} cannot be decoded", "broken")
     if pixels.shape[:2] != (-(-header.height // by), -(-header.width // by)):
@@ -190,6 +196,8 @@ def _imdecode(content: bytes, flags: int) -> NDArray[np.uint8] | None:
         if isinstance(error, MemoryError) or error.code == cv2.Error.StsNoMem:
             raise ImageError("the image needs more memory than there is", "too_large") from error
         return None
+    if pixels is not None and pixels.dtype == np.uint16:
+        pixels = pixels >> max(int(pixels.max()).bit_length() - 8, 0)
     return None if pixels is None else np.asarray(pixels, dtype=np.uint8)
 
 

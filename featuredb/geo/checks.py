@@ -79,7 +79,7 @@ def as_utm(name: str, value: ArrayLike) -> Points:
     bad = (np.abs(points.rows[:, :2]) <= 360.0).all(axis=1)
     if bad.any():
         raise GeodesyError(
-            f"{name}: expected rows of UTM easting, northing and height in metres, found "
-            f"{points.rows[bad][0].tolist()}, which look like degrees; convert them by utm_from_geodetic()"
+            f"{name}: expected easting, northing and height in metres, found {points.rows[bad][0].tolist()}, "
+            "which look like degrees; transform them to this zone"
         )
     return points

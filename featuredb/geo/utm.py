@@ -88,7 +88,7 @@ def geodetic_from_utm(utm: ArrayLike, epsg: int) -> FloatArray:
     The inverse of `utm_from_geodetic`, same shapes and errors; what looks like degrees is refused.
     """
     zone, hemisphere = zone_of(epsg)
-    points = as_utm("geodetic_from_utm", utm)
+    points = as_utm(f"coordinates in EPSG:{epsg}", utm)
     return points.shaped_like_input(lat_lon_h_from_utm(points.rows, zone, hemisphere == "south"))
 
 

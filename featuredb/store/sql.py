@@ -139,6 +139,8 @@ class SqlSession(AbstractContextManager["SqlSession"]):
             return SqlTable(table=self._connection.sql(self._statement(text)).to_arrow_table())
 
     def _statement(self, text: str) -> Any:
+        if not isinstance(text, str):
+            raise StoreError(f"SQL: expected the text of a SELECT, found {text!r}")
         statements = self._connection.extract_statements(text)
         if len(statements) != 1 or statements[0].type not in _ALLOWED:
             found = ", ".join(s.type.name for s in statements) or "nothing"

@@ -11,7 +11,7 @@ from typing import Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
+from featuredb.errors import InvalidValueError, VideoError
 
 _T = TypeVar("_T")
 NO_TAGS: Mapping[str, str] = MappingProxyType({})
@@ -43,7 +43,7 @@ class VideoOptions:
         bounds = [value for value in (self.start_s, self.end_s) if value is not None]
         if not all(math.isfinite(value) for value in bounds) or (len(bounds) == 2 and bounds[0] >= bounds[1]):
             raise InvalidValueError(
-                f"start_s, end_s: expected start_s < end_s, both finite, found {self.start_s}, {self.end_s}"
+                f"expected a start before the end, in seconds, found start {self.start_s}, end {self.end_s}"
             )
 
 
@@ -79,6 +79,11 @@ class VideoInfo:
     camera_key: str = ""
     focal_px: float | None = None
     live: bool = False
+
+    def no_frames(self) -> VideoError:
+        """Of a stretch in which there are none."""
+        length = "" if self.duration_s is None else f"; the film is {self.duration_s:.1f} s long"
+        return VideoError(f"{self.name}: no frame between the start and the end that were asked for{length}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

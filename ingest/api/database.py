@@ -15,7 +15,7 @@ from featuredb.store.durable.making import check_place
 from featuredb.store.sql import SqlSession, SqlTable
 from ingest.anchoring import AnchorRequest, anchor
 from ingest.api.anchor_words import anchoring_text
-from ingest.api.ingesting import IngestChoices, ingest, ingest_options
+from ingest.api.ingesting import IngestChoices, as_path, ingest, ingest_options, several
 from ingest.api.progress_bars import progress_bars
 from ingest.api.registering import place_by_control
 from ingest.api.results import Aligned, FilmTrack, Grown, Ingested, ListedMaps
@@ -90,9 +90,9 @@ class FeatureDatabase:
             IngestError: fewer than two usable photos. InvalidValueError: a choice that cannot be.
         """
         options = ingest_options(**choices)
-        require_photos(Path(photos))
-        folder = None if report is None else Path(report)
-        return Ingested(report=ingest(self.store, Path(photos), options, report=folder, quiet=quiet))
+        require_photos(as_path(photos))
+        done = ingest(self.store, as_path(photos), options, report=_path(report), quiet=quiet)
+        return Ingested(report=done)
 
     def align(
         self,
@@ -139,21 +139,22 @@ class FeatureDatabase:
                 f"{' and '.join(ways) or 'none'}"
             )
         if control_points is not None:
-            placed = place_by_control(self.store, map_id, Path(control_points))
+            placed = place_by_control(self.store, map_id, as_path(control_points))
             done = placed.committed is not None
             return Aligned(map_id=map_id, placed=done, report=placed, text=placed.as_text())
         if by_maps:
+            map_id = self.store.snapshot().find(map_id).map_id
             grown = self.grow()
             there = {m.map_id for m in self.maps.placed}
             return Aligned(map_id=map_id, placed=map_id in there, report=grown.report, text=str(grown))
         assert photos is not None
         request = AnchorRequest(
             map_id=map_id,
-            photos=Path(photos),
-            scan_ids=tuple(scans),
-            out=None if out is None else Path(out),
+            photos=as_path(photos),
+            scan_ids=several(scans),
+            out=_path(out),
             auto=auto,
-            confirm=tuple(confirm),
+            confirm=several(confirm),
             start=StartFiles(
                 pose=_path(pose),
                 picks=_path(picks),
@@ -187,10 +188,10 @@ class FeatureDatabase:
             prior: latitude, longitude (WGS84 degrees), standard deviation (m); believed as stated.
             camera: intrinsics; exact unless a CameraRequest gives sigmas.
             exif_prior: the position in the photo's EXIF settles what is ambiguous, where `prior` is None.
-            maps: ask only maps of these ids; one without a place answers in its own frame.
+            maps: ask only the map, or maps, of these ids; one without a place answers in its own frame.
 
         Raises:
-            ImageError, OSError: no usable image. InvalidValueError: a prior or camera that is none.
+            ImageError: no usable image. InvalidValueError: a prior or camera that is none.
             RequestError: a camera or maps that do not fit.
         """
         return self._asker.ask(
@@ -198,14 +199,14 @@ class FeatureDatabase:
             prior=prior,
             camera=camera,
             exif_prior=exif_prior,
-            maps=None if maps is None else tuple(maps),
+            maps=None if maps is None else several(maps),
         )
 
     def track(
         self,
         film: PathLike,
         *,
-        out: Sequence[PathLike] = (),
+        out: PathLike | Sequence[PathLike] = (),
         overlay: PathLike | None = None,
         by: FilmBy = "map",
         maps: Sequence[str] | None = None,
@@ -219,7 +220,7 @@ class FeatureDatabase:
 
         Args:
             film: a file, a folder of pictures, or an address.
-            out: trajectories to write, by their suffix: .csv, .tum, .geojson, .kml, .json.
+            out: trajectory, or several, to write, by their suffix: .csv, .tum, .geojson, .kml, .json.
             overlay: an mp4 with the track drawn over the film.
             by: maps, a scan, or both. maps, scans: ids; None: all.
             pose: file of the first frame's rough pose. prior: where the film begins.
@@ -231,15 +232,15 @@ class FeatureDatabase:
         """
         ground = FilmGround(
             by=by,
-            maps=None if maps is None else tuple(maps),
-            scans=None if scans is None else tuple(scans),
+            maps=None if maps is None else several(maps),
+            scans=None if scans is None else several(scans),
             pose_file=_path(pose),
         )
         return FilmTrack(
             film=track_film(
                 self.store,
                 film,
-                out=[Path(file) for file in out],
+                out=[as_path(file) for file in several(out)],
                 overlay=_path(overlay),
                 ground=ground,
                 camera=camera,
@@ -276,7 +277,7 @@ class FeatureDatabase:
         Raises:
             ExportError: an unknown format, or `out` is there already. MissingExtraError
         """
-        return export_maps(self.store, Path(out), format, selection or Selection(), as_of=as_of, **options)
+        return export_maps(self.store, as_path(out), format, selection or Selection(), as_of=as_of, **options)
 
     def grow(self, options: GrowingOptions | None = None, *, quiet: bool = False) -> Grown:
         """Let contributed photos become maps, and maps without a place find theirs; as `featuredb grow`.
@@ -292,6 +293,8 @@ def open_database(
     url: PathLike, *, create: bool = False, storage_options: Mapping[str, str] | None = None
 ) -> FeatureDatabase:
     """See `featuredb.open`."""
+    if not isinstance(url, str | Path):
+        raise InvalidValueError(f"open: expected a folder or an address in an object store, found {url!r}")
     if not create:
         return FeatureDatabase(Database.open(url, storage_options=storage_options))
     check_place(Database(str(url), storage_options).url)
@@ -299,4 +302,4 @@ def open_database(
 
 
 def _path(path: PathLike | None) -> Path | None:
-    return None if path is None else Path(path)
+    return None if path is None else as_path(path)

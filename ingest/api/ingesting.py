@@ -1,7 +1,7 @@
 """What a person says of an ingest, and the ingest of photos that follows from it."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack
@@ -102,7 +102,7 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
     if of_points and asked.get("gcp") is None:
         raise InvalidValueError(f"ingest: {', '.join(of_points)}: expected gcp beside it, control points")
     if asked.get("work") is not None:
-        asked["work"] = Path(asked["work"])
+        asked["work"] = as_path(asked["work"])
 
     def given(**names: str) -> dict[str, Any]:
         return {name: asked[choice] for name, choice in names.items() if asked.get(choice) is not None}
@@ -115,7 +115,7 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
         **given(cameras="cameras"),
     )
     scan = ScanOptions(
-        exclude=tuple(asked.get("exclude", ())),
+        exclude=several(asked.get("exclude") or ()),
         films=films,
         **given(owner="owner", licence="licence", trust_geotags="trust_geotags"),
     )
@@ -130,11 +130,27 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
     )  # fmt: skip
 
 
+def as_path(path: Any) -> Path:
+    """
+    Raises:
+        InvalidValueError: no path.
+    """
+    try:
+        return Path(path)
+    except TypeError as error:
+        raise InvalidValueError(f"expected a path, found {path!r}") from error
+
+
+def several(given: Any) -> tuple[Any, ...]:
+    """One or several; a text is one, and not its letters."""
+    return tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
+
+
 def _survey(asked: dict[str, Any], keep_focal: bool) -> Survey | None:
     if asked.get("gcp") is None:
         return None
     return Survey(
-        file=read_control_file(Path(asked["gcp"]), asked.get("gcp_crs")),
+        file=read_control_file(as_path(asked["gcp"]), asked.get("gcp_crs")),
         options=GcpOptions(
             sigma_m=asked.get("gcp_sigma"), ground_m=asked.get("ground_height"), keep_lens=keep_focal
         ),

@@ -230,6 +230,8 @@ def make_stills(
             check_overlap(when, telemetry)
         progress("motion", 0, video.info.frame_count or 0)
         motion = measure_motion(video)
+        if not len(motion):
+            raise video.info.no_frames()
         notes = list(video.report.complaints())
     choice = choose_keyframes(motion, options.keyframes)
     if not choice.index:

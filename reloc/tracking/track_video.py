@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.atomic import file_sha256
-from featuredb.errors import VideoError
 from featuredb.features.exif.read import unnamed_model
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
@@ -188,7 +187,7 @@ def track_video(
                     writer.write(picture[: writer.height, : writer.width], frame.time_s - first_s)
                     clock.lap("drawing")
             if not points:
-                raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
+                raise info.no_frames()
             _filled(points, tracker.finish())
             complaints = (*trouble, *video.report.complaints())
             lens = tracker.camera

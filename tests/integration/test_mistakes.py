@@ -23,6 +23,7 @@ from featuredb.store import Database
 from reloc.client import Client
 from tests.conftest import REPOSITORY
 from tests.support import planar_map as field
+from tests.support.films import film
 
 # Command, and what its line has to say. {port} is one at which nobody listens.
 MISTAKES = {
@@ -82,6 +83,22 @@ MISTAKES = {
         "track field.db photos --out track.csv",
         r"expected the times of its 1 pictures, found none; .* or give their rate by --fps",
     ),
+    "an end before the start": (
+        "track field.db film.mp4 --start 5 --end 2 --out track.csv",
+        r"expected a start before the end, in seconds, found start 5\.0, end 2\.0",
+    ),
+    "a start past the end of a film that is tracked": (
+        "track field.db film.mp4 --start 50 --out track.csv",
+        r"film\.mp4: no frame between the start and the end .*; the film is 1\.2 s long",
+    ),
+    "a start past the end of a film that is ingested": (
+        "ingest video new.db film.mp4 --start 50 --quiet",
+        r"film\.mp4: no frame between the start and the end .*; the film is 1\.2 s long",
+    ),
+    "a film that is a picture": (
+        "ingest video new.db film.gif --quiet",
+        r"featuredb: film\.gif: expected mp4, mov",
+    ),
 }
 
 
@@ -93,6 +110,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "photos" / "a.jpg").write_bytes(b"\xff\xd8\xff\xe0 not much")
     (here / "texts").mkdir()
     (here / "texts" / "a.txt").write_text("no photo")
+    (here / "film.gif").write_bytes(b"GIF89a and so on")
+    film(here, "mp4")
     scan = laspy.LasData(laspy.LasHeader(point_format=1, version="1.2"))
     place = np.array([456_800.0, 5_429_300.0, 100.0]) + np.random.default_rng(0).uniform(0, 50, (100, 3))
     scan.x, scan.y, scan.z = place.T

@@ -19,6 +19,7 @@ from featuredb.errors import (
     MapNotFoundError,
     MissingExtraError,
     StoreError,
+    VideoError,
 )
 from featuredb.extras import require
 from tests.integration.test_localise import POSE, moved
@@ -64,9 +65,16 @@ def test_a_photo_is_a_path_bytes_or_pixels(url: Path, photo: Path, pixels: NDArr
     assert first.heading_pitch_roll_deg is not None
     assert first.heading_pitch_roll_deg[1] == pytest.approx(-82.0, abs=0.1)  # tilted by 8 degrees
     assert first.overlay().shape == (480, 640, 3)
-    for wrong in (pixels.astype(float), np.zeros((2, 2, 4), np.uint8)):
-        with pytest.raises(ImageError, match="uint8"):
-            db.localise(wrong)
+    assert db.localise(photo, camera=CAMERA, maps="field").localised
+    for wrong, said in (
+        (pixels.astype(float), "uint8"),
+        (np.zeros((2, 2, 4), np.uint8), "uint8"),
+        (None, "expected a path, bytes, or pixels"),
+        ("nix.jpg", r"nix\.jpg cannot be read"),
+        (photo.parent, "not a regular file"),
+    ):
+        with pytest.raises(ImageError, match=said):
+            db.localise(wrong)  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match=r"lat: .* less than or equal to 90, found 95"):
         db.localise(photo, prior=(95.0, 0.0, 10.0))
 
@@ -160,6 +168,19 @@ def test_what_cannot_be_done_is_said_in_one_sentence(url: Path, tmp_path: Path) 
     gcp.write_text("EPSG:32632\n" + "".join(f"{i} {i} {i} {i} {i} 0.png\n" for i in range(4)))
     with pytest.raises(MapNotFoundError):
         db.align("no map", control_points=gcp)
+    with pytest.raises(MapNotFoundError):
+        db.align("no map", by_maps=True)
+    for create in (False, True):
+        with pytest.raises(InvalidValueError, match=r"expected a folder or an address .* found None"):
+            featuredb.open(None, create=create)  # type: ignore[arg-type]
+    with pytest.raises(InvalidValueError, match="expected a path, found 5"):
+        db.ingest(5)  # type: ignore[arg-type]
+    with pytest.raises(StoreError, match="found None"):
+        db.sql(None)  # type: ignore[arg-type]
+    with pytest.raises(ExportError, match="found bogus"):
+        db.export(tmp_path / "x", "ply", bogus=1)
+    with pytest.raises(VideoError, match=r"nix\.mp4"):
+        db.track("nix.mp4", out=str(tmp_path / "track.csv"))
     assert db.grow(quiet=True).report.photos == ()
     with pytest.raises(MissingExtraError, match=r"featuredb\[notebook\]"):
         require("notebook", "df()", "no_such_package")

@@ -95,7 +95,7 @@ def test_a_film_of_elsewhere_gives_a_table_of_reasons(
         (["--out", "t.csv", "--camera", "PINHOLE,640"], "--camera: expected MODEL,WIDTH,HEIGHT"),
         (["--out", "t.csv", "--camera", "PINHOLE,640,640,600,600,320,320"], "differ in aspect ratio"),
         (["--out", "t.csv", "--prior", "north"], "--prior: expected LAT,LON,SIGMA_M"),
-        (["--out", "t.csv", "--start", "60"], "no frames"),
+        (["--out", "t.csv", "--start", "60"], "the film is 1.5 s long"),
         (["--out", "t.csv", "--map", "nobody"], "nobody"),
     ],
 )

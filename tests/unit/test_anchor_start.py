@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from featuredb.errors import RegistrationError
+from featuredb.errors import GeodesyError, RegistrationError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
+from ingest.register.anchor.start.first_place import check_on_scan
 from ingest.register.anchor.start.picks import KNOWN_FOCAL_REL, Picks, pose_from_picks, read_picks
 from ingest.register.anchor.start.priors import (
     MIN_SIGMA_HORIZONTAL_M,
@@ -193,6 +194,24 @@ def test_files_of_picks(tmp_path: Path) -> None:
     assert (first.image, second.image) == ("b.jpg", "a.jpg")
     np.testing.assert_array_equal(first.pixels, [[4, 5]])
     np.testing.assert_array_equal(second.utm, [[6, 7, 8]])
+    for text in ("1,5;2;3;4,25;5", "1,5\t2\t3\t4,25\t5", "1.5 2  3 4.25 5"):
+        path.write_text(text, encoding="utf-16")
+        (picks,) = read_picks(path, "a.jpg")
+        np.testing.assert_array_equal(np.hstack([picks.pixels, picks.utm]), [[1.5, 2, 3, 4.25, 5]])
+
+
+def test_picks_far_from_the_scan_are_told_with_the_distance() -> None:
+    frame = random_map(1).frame
+    cloud = build_cloud(frame, "unknown", np.random.default_rng(0).uniform(-50, 50, (100, 3)))
+
+    def check(*utm: float) -> None:
+        check_on_scan([Picks(image="a.jpg", pixels=np.ones((1, 2)), utm=np.array([utm]))], cloud, EPSG)
+
+    check(EASTING, NORTHING, HEIGHT)
+    with pytest.raises(RegistrationError, match=r"picks of a\.jpg: .* 9\.0 km to the east of it"):
+        check(EASTING + 9_050.0, NORTHING, HEIGHT)
+    with pytest.raises(GeodesyError, match=f"EPSG:{EPSG}: expected easting, .* look like degrees"):
+        check(49.0, 8.4, HEIGHT)
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,14 @@ def test_sixteen_bits_keep_the_upper_eight() -> None:
         np.testing.assert_allclose(decode_gray(data), np.asarray(_scene("L")), atol=1)
 
 
+def test_twelve_bits_in_sixteen_are_no_dark_picture() -> None:
+    pixels = np.asarray(_scene()).astype(np.uint16) << 4
+    for extension in (".png", ".tiff"):
+        data = cv2.imencode(extension, pixels[:, :, ::-1])[1].tobytes()
+        np.testing.assert_allclose(decode_rgb(data), np.asarray(_scene()), atol=1)
+        np.testing.assert_allclose(decode_gray(data), np.asarray(_scene("L")), atol=2)
+
+
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
 def test_orientation_is_not_applied(orientation: int) -> None:
     exif = Image.Exif()

@@ -11,9 +11,12 @@ _NOT_COUNTED = ("decisions", "measurements", "measurements.md")
 # Types and enumerations in which the program lists codes, and the arguments that hand one on.
 _LISTS = re.compile(r"\w*(Reason|ErrorCode|ERROR_CODES)")
 _ARGUMENTS = {"reason", "reason_code"}
-_CODE, _LIKE_A_CODE = re.compile(r"[A-Z_]{3,}|[a-z]+(_[a-z]+)*"), re.compile(r"[A-Z]+(_[A-Z]+)+")
+_CODE, _LIKE_A_CODE = (
+    re.compile(r"[A-Z_]{3,}|[a-z]+(_[a-z]+)*"),
+    re.compile(r"([A-Z]+(?:_[A-Z]+)+|[A-Z_]{5,}(?=: [a-z]))(?:: .*)?", re.DOTALL),
+)
 _NO_REASONS = re.compile(
-    r"FEATUREDB_.*|\w+_NUM_THREADS|XDG_CACHE_HOME|DELTA_LENGTH_BYTE_ARRAY|MEDIA_TYPE|[A-Z_]*(OPENCV|PINHOLE|RADIAL|FISHEYE)"
+    r"FEATUREDB_.*|\w+_NUM_THREADS|XDG_CACHE_HOME|DELTA_LENGTH_BYTE_ARRAY|COLMAP|MEDIA_TYPE|[A-Z_]*(OPENCV|PINHOLE|RADIAL|FISHEYE)"
 )
 
 
@@ -41,7 +44,9 @@ def test_troubleshooting_names_every_reason() -> None:
     for module in modules:  # one tree at a time: all of them together are long gone through for garbage
         tree = ast.parse(module.read_text(encoding="utf-8"))
         given.update(reasons_in(tree))
-        strings.update(text.lower() for node in ast.walk(tree) for text in strings_of(node))
+        strings.update(
+            text.lower().partition(": ")[0] for node in ast.walk(tree) for text in strings_of(node)
+        )
     assert given > {
         "NO_COVERAGE",
         "BUSY",
@@ -68,7 +73,7 @@ def reasons_in(tree: ast.Module) -> Iterator[str]:
         elif isinstance(node, ast.keyword) and node.arg in _ARGUMENTS:
             found = [text for text in strings_of(node.value) if _CODE.fullmatch(text)]
         else:
-            found = [text for text in strings_of(node) if _LIKE_A_CODE.fullmatch(text)]
+            found = [m[1] for text in strings_of(node) if (m := _LIKE_A_CODE.fullmatch(text))]
         yield from (text for text in found if not _NO_REASONS.fullmatch(text))
 
 

@@ -66,14 +66,14 @@ def test_names_and_units(text: str, name: str, unit: str) -> None:
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("1", 1.0), (" -2.50 ", -2.5), ("+.5", 0.5), ("3.", 3.0), ("1e-5", 1e-5), ("1E2", 100.0)],
+    [("1", 1.0), (" -2.50 ", -2.5), ("+.5", 0.5), ("3.", 3.0), ("1e-5", 1e-5), ("1E2", 100.0), ("1,5", 1.5)],
 )
 def test_numbers(text: str, value: float) -> None:
     assert number(text) == value
 
 
 @pytest.mark.parametrize(
-    "text", ["", "n/a", "nan", "inf", "0x10", "1_000", "٣", "1e999", "--1", "1,5", "1 2"]
+    "text", ["", "n/a", "nan", "inf", "0x10", "1_000", "٣", "1e999", "--1", "1,5,2", "1 2"]
 )
 def test_what_is_no_number(text: str) -> None:
     assert np.isnan(number(text))
@@ -106,7 +106,7 @@ def test_times(names: str, rows: list[str], times: list[float], clock: str, firs
 @pytest.mark.parametrize(
     "text",
     [
-        "time_s;latitude;longitude;altitude\n0;47,5;8,25;430,5\n1;47,50001;8,25;431\n",
+        "time_s;latitude;longitude;altitude\n0,000;47,5;8,25;430,5\n1,000;47,50001;8,25;431\n",
         "time_s\tlatitude\tlongitude\taltitude\n0\t47.5\t8.25\t430.5\n\n1\t47.50001\t8.25\t431\n",
         'sep=,\r\n"Time_s","Latitude","Longitude","Altitude [m]"\r\n"0","47.5","8.25","430.5"\r\n'
         "1,47.50001,8.25,431\r\n",

@@ -49,6 +49,10 @@ def test_points_with_times_are_samples() -> None:
     assert "1 positions at 0, 0" in told
 
 
+def test_decimal_commas_are_read() -> None:
+    assert read_gpx(GPX.replace('"47.5"', '"47,5"').encode()).latitude_deg[0] == 47.5
+
+
 def test_gpx_1_0_and_utf_16_are_read_too() -> None:
     old = GPX.replace("GPX/1/1", "GPX/1/0").replace('encoding="UTF-8"', 'encoding="UTF-16"')
     assert read_gpx(old.encode("utf-16")).latitude_deg[0] == 47.5

@@ -1,5 +1,7 @@
 """Drones' subtitles: each dialect by a text of our own, the order of coordinates, damage, and any bytes."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -189,12 +191,20 @@ def test_samples_without_a_fix_are_kept_without_a_place(fix: str) -> None:
 
 @pytest.mark.parametrize(
     "place",
-    ["[latitude: 47,5] [longitude: 8,25]", "GPS(47,5,8,25,16)", "GPS(47,5, 8,25)", "GPS(47.5N,8.25E,16)"],
+    ["[latitude: 47,5,8] [longitude: 8,25]", "GPS(47,5,8,25,16)", "GPS(47,5, 8,25)", "GPS(47.5N,8.25E,16)"],
 )
 def test_what_may_be_another_number_is_no_number(place: str) -> None:
     """A decimal comma must not cost the decimals."""
     with pytest.raises(TelemetryError, match="none with a position"):
         read_srt(f"1\n00:00:00,000 --> 00:00:01,000\nBAROMETER:1.5\n{place}\n".encode())
+
+
+def test_decimal_commas_of_named_values_are_read() -> None:
+    names, values = BRACKETED.split("[iso", 1)
+    value = read_srt((names + "[iso" + re.sub(r"(?<=\d)\.(?=\d)", ",", values)).encode())
+    assert value.latitude_deg[0] == 47.5
+    assert value.relative_height_m[0] == 12.3
+    assert value.gimbal_ypr_deg[0].tolist() == [-170.5, -45.0, 0.5]
 
 
 def test_names_stand_above_the_order_of_a_tuple() -> None:
@@ -277,6 +287,7 @@ def test_joined_recordings_are_told() -> None:
         ),
         (b"1\n00:00:00,000 --> 00:00:00,039\n[latitude: 47.5] [longitude: 8.", "only subtitle is cut off"),
         (positional(["N/A,N/A,3", "N/A,N/A,4"]), "none with a position"),
+        (b"1\n00:00:00,000 --> 00:00:00,039\nFrameCnt : 1\n", r"some\.srt \(SRT\): 1 samples"),
         (positional(["0.0,0.0,3"]), "0, 0 are a receiver without a fix"),
         (b"\x00\x01\x02\xff" * 100, "0 subtitles"),
     ],

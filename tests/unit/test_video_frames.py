@@ -205,7 +205,7 @@ def test_memory_stays_bounded(tmp_path: Path) -> None:
     ],
 )
 def test_options_are_checked(wrong: dict[str, float]) -> None:
-    with pytest.raises(InvalidValueError, match=next(iter(wrong))):
+    with pytest.raises(InvalidValueError, match=next(iter(wrong)).removesuffix("_s")):
         VideoOptions(**wrong)  # type: ignore[arg-type]
 
 

@@ -222,7 +222,9 @@ def telemetry_of_video(path: Path) -> Telemetry | None:
         except TelemetryError as error:
             refused.append(str(error))
     candidates += _sidecars(path)
-    if not candidates and not refused:
+    if not candidates:
+        if refused:
+            raise TelemetryError(refused[0])
         return None
     return _first_readable(path.name, candidates, refused, damage)
 

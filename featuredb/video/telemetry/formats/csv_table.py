@@ -289,9 +289,7 @@ def _telemetry(
 
 
 def _numbers(texts: list[str], quantity: str, origin: str, warnings: list[str]) -> FloatArray:
-    # Tables with semicolons may have decimal commas.
-    pointed = (t.replace(",", ".") if re.fullmatch(r"\s*[+-]?\d+,\d+\s*", t) else t for t in texts)
-    values = np.array([number(text) for text in pointed])
+    values = np.array([number(text) for text in texts])
     written = [text.strip() for text, value in zip(texts, values, strict=True) if np.isnan(value)]
     words = [text for text in written if text and text.lower() not in _NO_VALUE]
     if len(words) > _MOST * len(texts):

@@ -157,7 +157,7 @@ def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
         warnings.append(f"{len(dialects)} dialects in one file: recordings of several drones were joined")
     return assemble(
         columns | times,
-        source="SRT, " + " + ".join(dialects),
+        source=", ".join(["SRT", *filter(None, [" + ".join(dialects)])]),
         origin=origin,
         clock="local",
         in_video_time="times_s" in times,

@@ -20,7 +20,7 @@ from featuredb.video.telemetry.axis_order import ThirdValue
 
 _NUMBER = r"[+-]?\d{1,12}(?:\.\d{0,15})?"
 _GROUP = re.compile(r"\[([^\[\]]{0,300})\]")
-_PAIR = re.compile(rf"([A-Za-z_]+)\s*:\s*({_NUMBER})(?![\d.]|,\d)")
+_PAIR = re.compile(r"([A-Za-z_]+)\s*:\s*([+-]?\d{1,12}(?:[.,]\d{0,15})?)(?![\d.]|,\d)")
 _TUPLE = re.compile(r"(?<![A-Za-z.])(GPS|HOME|G\.PRY)\s*\(([^()]{0,200})\)")
 _COORDINATE = re.compile(rf"^(?:([NSEW])\s*:?\s*)?({_NUMBER})\s*(m?)$", re.IGNORECASE)
 _BAROMETER = re.compile(rf"\b(?:BAROMETER\s*[:(]|Hb:)\s*({_NUMBER})(?=[Mm\s)]|$)")
@@ -86,7 +86,8 @@ def parse_block(text: str) -> BlockFields:
 def _read_groups(text: str, fields: BlockFields) -> None:
     """The named values in closed square brackets."""
     for group in _GROUP.findall(text):
-        for name, number in _PAIR.findall(group):
+        for name, written in _PAIR.findall(group):
+            number = written.replace(",", ".")
             key, value = name.lower(), float(number)
             fields.dialect = "bracketed"
             if key in _NAMES:

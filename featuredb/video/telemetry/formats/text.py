@@ -20,7 +20,7 @@ _CLOCK = re.compile(
     r"(?:\s?(?P<zone>Z|UTC|[+-]\d{2}:?\d{2})\b)?"
 )
 
-_NUMBER = re.compile(r"[+-]?(?:\d{1,18}(?:\.\d{0,20})?|\.\d{1,20})(?:[eE][+-]?\d{1,2})?", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(?:\d{1,18}(?:[.,]\d{0,20})?|[.,]\d{1,20})(?:[eE][+-]?\d{1,2})?", re.ASCII)
 _BRACKET = re.compile(r"^(.*?)\s*[\(\[]\s*([^()\[\]]*?)\s*[\)\]]\s*$")
 
 # Unit: the quantity it measures and what turns it into metres, degrees, seconds.
@@ -46,8 +46,8 @@ class ColumnName(NamedTuple):
 
 
 def number(text: str) -> float:
-    """A decimal number, or NaN for anything else: empty, "n/a", words, infinity."""
-    stripped = text.strip()
+    """A number with a decimal point or comma, or NaN for anything else: empty, "n/a", words, infinity."""
+    stripped = text.strip().replace(",", ".")
     return float(stripped) if _NUMBER.fullmatch(stripped) else math.nan
 
 

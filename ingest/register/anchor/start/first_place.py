@@ -9,6 +9,7 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError, RegistrationError
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.words import way_words
 from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import chosen_scans, load_cloud
 from featuredb.maps.feature_map import FeatureMap, MapImage
@@ -172,6 +173,26 @@ def started_images(
             prior, note = one.prior(frame, epsg), f"{image.name} starts from the pose given for it"
         started.append(StartedImage(image=image, prior=prior, camera=camera, note=note))
     return started
+
+
+def check_on_scan(told: Sequence[RoughPose | Picks], cloud: PointCloud, epsg: int) -> None:
+    """
+    Args:
+        told: by `StartFiles.read`, in the zone `epsg`. cloud: the scan around the map.
+
+    Raises:
+        RegistrationError: a pose or picks so far outside of the scan that no photo of a drone shows both.
+    """
+    low, high = cloud.xyz[:, :2].min(axis=0), cloud.xyz[:, :2].max(axis=0)
+    for one in told:
+        xy = np.median(np.atleast_2d(cloud.frame.enu_from_utm(one.utm, epsg))[:, :2], axis=0)
+        way = xy - np.clip(xy, low, high)
+        if np.hypot(*way) > _FIRST_REACH_M:
+            what = "picks" if isinstance(one, Picks) else "pose"
+            raise RegistrationError(
+                f"{what} of {one.image}: expected a place on the scan around the map, found one that lies "
+                f"{way_words(*way.tolist())} of it; check easting, northing and their zone, EPSG:{epsg}"
+            )
 
 
 def first_place(

@@ -12,6 +12,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import MapImage
 from featuredb.maps.unplaced_map import AnyMap
+from featuredb.video.telemetry.formats.text import decode_text
+from featuredb.video.telemetry.formats.text import number as decimal
 from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
 from ingest.register.anchor.start.priors import honest_prior
 from ingest.register.frame_registration import FramePrior
@@ -51,8 +53,9 @@ def read_picks(path: Path, image: str | None) -> list[Picks]:
     """Picks from a CSV file, grouped by photo in the order of the file.
 
     Lines hold `x, y, easting, northing, height`: full-size pixels whose top-left one has its centre at (0.5,
-    0.5), then metres. A header may name the columns in another order, and a column `image` besides; empty
-    lines and lines that start with # are skipped.
+    0.5), then metres. Commas, semicolons, tabs or spaces separate; between all but commas, commas may be
+    decimal. A header may name the columns in another order, and a column `image` besides; empty lines and
+    lines that start with # are skipped.
 
     Args:
         image: photo of lines that name none.
@@ -61,15 +64,18 @@ def read_picks(path: Path, image: str | None) -> list[Picks]:
         RegistrationError: unreadable, a line that is not five numbers, or no photo named.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise RegistrationError(f"picks {path}: cannot be read as text ({error})") from error
+        lines = decode_text(path.read_bytes()).splitlines()
+    except OSError as error:
+        raise RegistrationError(f"picks {path}: cannot be read ({error})") from error
     numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
     none = f"picks {path}: expected lines of x, y, easting, northing, height, found none"
     if not numbered:
         raise RegistrationError(none)
-    separator = max(",;\t", key=numbered[0][1].count)
-    rows = [next(csv.reader([line], delimiter=separator)) for _, line in numbered]
+    # Five columns have four separators; semicolons before commas, which are decimal between them.
+    separator = next((mark for mark in ";\t," if numbered[0][1].count(mark) >= 4), None)
+    rows = [
+        next(csv.reader([line], delimiter=separator)) if separator else line.split() for _, line in numbered
+    ]
     names = [cell.strip().lower() for cell in rows[0]]
     first = int(set(_COLUMNS) <= set(names))  # 1 behind a header
     picks: dict[str, list[list[float]]] = {}
@@ -77,10 +83,10 @@ def read_picks(path: Path, image: str | None) -> list[Picks]:
         found = dict(zip(names if first else (*_COLUMNS, "image"), map(str.strip, cells), strict=False))
         where = f"picks {path}, line {number}"
         try:
-            values = [float(found[name]) for name in _COLUMNS]
-        except (KeyError, ValueError) as error:
+            values = [decimal(found[name]) for name in _COLUMNS]
+        except KeyError as error:
             words = "expected x, y, easting, northing, height"
-            raise RegistrationError(f"{where}: {words}, found {cells} ({error})") from error
+            raise RegistrationError(f"{where}: {words}, found {cells}") from error
         if not np.isfinite(values).all():
             raise RegistrationError(f"{where}: expected finite numbers, found {cells}")
         name = found.get("image") or image
