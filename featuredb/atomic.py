@@ -64,9 +64,9 @@ def atomic_file(path: Path) -> Iterator[Path]:
         _flush(temporary)
         os.replace(temporary, path)  # noqa: PTH105 (the name says what it does)
     except OSError as error:
-        if error.filename in (None, str(temporary)):  # a full disk names no file
-            error.filename = str(path)
-        raise
+        if error.errno is None or error.filename not in (None, str(temporary)):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error  # a full disk names no file
     finally:
         temporary.unlink(missing_ok=True)
     _flush(path.parent)

@@ -12,7 +12,13 @@ from featuredb.cli.main import run_command
 
 def _full_disk(args: argparse.Namespace) -> None:
     with atomic_file(args.path):
-        raise OSError(errno.ENOSPC, "No space left on device")  # as a write to an open file says it
+        raise _FilmError(errno.ENOSPC, "No space left on device")  # no file, as where an open one is written
+
+
+class _FilmError(OSError):
+    """As PyAV's: its file name cannot be changed."""
+
+    filename = property(lambda _: None)
 
 
 def _delta(args: argparse.Namespace) -> None:
