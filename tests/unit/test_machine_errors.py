@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -29,7 +30,7 @@ def _delta(args: argparse.Namespace) -> None:
     ("run", "said"), [(_full_disk, "{}: No space left on device; "), (_delta, "Permission denied; ")]
 )
 def test_a_disk_or_a_right_is_told_in_a_line(
-    run: object, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Callable[[argparse.Namespace], None], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "t.csv"
     assert run_command(run, argparse.Namespace(path=path)) == 2
