@@ -24,6 +24,21 @@ def on_stop_signals(stop: Callable[[], object]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """Within it SIGTERM interrupts as Ctrl-C does, so that temporary files go; elsewhere than in the main
+    thread nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def handle_as_before() -> None:
     """SIGTERM is answered as Python knows it, whatever a native library has put in place of that."""
     if threading.current_thread() is threading.main_thread():

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from featuredb.atomic import atomic_file
 from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import decode_rgb
 from featuredb.features.shrink import shrunk
@@ -76,7 +77,8 @@ def write_overlay(
     """
     encoded, png = cv2.imencode(".png", draw_overlay(photo, reply, other_points_utm))
     try:
-        path.write_bytes(png.tobytes() if encoded else b"")
+        with atomic_file(path) as part:
+            part.write_bytes(png.tobytes() if encoded else b"")
     except OSError as error:
         raise FeatureDbError(f"overlay: cannot write {path}: {error.strerror or error}") from error
 

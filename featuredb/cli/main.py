@@ -7,12 +7,14 @@ can do something about. There is an entry point for every subcommand, of its nam
 the one that runs is loaded; several may name the same function.
 
 Exit codes: 0 done; 1 done, and the answer is no (damage found, not localised); 2 wrong usage or a
-FeatureDbError; 70 a defect of the program; 130 interrupted.
+FeatureDbError, or a disk or a right that is missing; 70 a defect of the program; 130 interrupted.
 """
 
 import argparse
+import errno
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
@@ -25,6 +27,11 @@ logger = logging.getLogger(__name__)
 
 COMMAND_GROUP = "featuredb.commands"
 EXIT_ERROR, EXIT_DEFECT, EXIT_INTERRUPTED = 2, 70, 130  # 1: the command itself says no
+# Errors of the system that no program can prevent: its disks, rights and limits.
+_OF_THE_MACHINE = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO),
+    *(errno.EMFILE, errno.ENFILE, errno.ENAMETOOLONG),
+)
 
 Register = Callable[[Any], None]
 
@@ -93,9 +100,28 @@ def run_command(run: Callable[[argparse.Namespace], int | None], args: argparse.
         # The reader of our output (`| head`) has seen enough. Python would complain again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except Exception:
+    except Exception as error:
+        number = isinstance(error, OSError) and (error.errno or _errno_in(str(error)))
+        if number in _OF_THE_MACHINE:
+            logger.debug("%s", error, exc_info=True)
+            sys.stderr.write(_refused(error, number))
+            return EXIT_ERROR
         logger.exception("a defect of the program; please report it with the lines below")
         return EXIT_DEFECT
+
+
+def _errno_in(text: str) -> int | None:
+    """What a library that is not written in Python says of the system's error."""
+    found = re.search(r"os error (\d+)", text)
+    return int(found[1]) if found else None
+
+
+def _refused(error: Exception, number: int) -> str:
+    where = getattr(error, "filename", None) or "a file"
+    return (
+        f"featuredb: cannot read or write {where}: {os.strerror(number)}; free space there, get the right to "
+        "use it, or choose another place\n"
+    )
 
 
 def _common_parser() -> argparse.ArgumentParser:

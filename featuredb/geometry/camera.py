@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.stop_signals import handle_as_before
 
 if TYPE_CHECKING:
     from numpy.polynomial import Polynomial
@@ -146,10 +147,12 @@ class Camera:
         return np.asarray(self.to_pycolmap().cam_from_img(xy), dtype=np.float64)
 
 
+@cache
 def _pycolmap() -> Any:
     """Imported where a camera is, and not for what only speaks of cameras: listing maps, a command's help."""
     import pycolmap
 
+    handle_as_before()  # its glog has put a handler there that prints a stack trace
     return pycolmap
 
 

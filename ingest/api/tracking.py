@@ -1,10 +1,11 @@
 """A film tracked by a database: the poses, files of them, and a summary."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from featuredb.atomic import check_output
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import GeoPrior
@@ -89,9 +90,12 @@ def track_film(
     Raises:
         InvalidValueError, VideoError, StoreError, RegistrationError, ScanNotFoundError
     """
-    check_outputs(out)
+    ground = ground or FilmGround()
+    check_outputs(out, film, ground.pose_file)
+    if overlay is not None:
+        check_output("--overlay", overlay, film, ground.pose_file)
     options = options or TrackVideoOptions()
-    finder = finder_for(database, ground or FilmGround(), camera, options.track)
+    finder = finder_for(database, ground, camera, options.track)
     if isinstance(finder, MapFinder) and finder.own_map is not None:
         for file in out:
             format_of(file, finder.own_map)
@@ -107,4 +111,7 @@ def track_film(
         overlay=overlay,
         options=options,
     )
-    return TrackedFilm(video=found, outputs=write_outputs(out, found.trajectory), overlay=overlay)
+    outputs = write_outputs(out, found.trajectory)
+    if found.undrawn:
+        outputs, overlay = replace(outputs, failed=(found.undrawn, *outputs.failed)), None
+    return TrackedFilm(video=found, outputs=outputs, overlay=overlay)

@@ -62,11 +62,13 @@ def register(subparsers: Any) -> None:
 
 
 def run_track(args: argparse.Namespace) -> int:
-    """Track and write; 0, 1 where no frame was localised, 2 where a file could not be written.
+    """Track and write; 0, 1 where no frame was localised, 2 where a file could not be written, 130 where the
+    film was stopped before its end.
 
     Raises:
         InvalidValueError, VideoError, StoreError, ServiceError, RegistrationError, ScanNotFoundError
     """
+    from featuredb.stop_signals import sigterm_as_ctrl_c
     from ingest.api.tracking import track_film
     from ingest.track.finders import FilmGround
     from reloc.answered_view import camera_of, geo_prior
@@ -75,22 +77,23 @@ def run_track(args: argparse.Namespace) -> int:
     from reloc.tracking.trajectory.files import exit_code
 
     camera, prior = parse_camera(args.camera), parse_prior(args.prior)
-    done = track_film(
-        open_database(args),
-        args.video,
-        out=args.out,
-        overlay=args.overlay,
-        ground=FilmGround(
-            by=args.by,
-            maps=tuple(args.map) if args.map else None,
-            scans=tuple(args.scan) if args.scan else None,
-            pose_file=args.pose,
-        ),
-        camera=None if camera is None else camera_of(camera),
-        prior=None if prior is None else geo_prior(prior),
-        options=TrackVideoOptions(
-            max_side_px=args.max_side, start_s=args.start, end_s=args.end, fps=args.fps
-        ),
-    )
+    with sigterm_as_ctrl_c():
+        done = track_film(
+            open_database(args),
+            args.video,
+            out=args.out,
+            overlay=args.overlay,
+            ground=FilmGround(
+                by=args.by,
+                maps=tuple(args.map) if args.map else None,
+                scans=tuple(args.scan) if args.scan else None,
+                pose_file=args.pose,
+            ),
+            camera=None if camera is None else camera_of(camera),
+            prior=None if prior is None else geo_prior(prior),
+            options=TrackVideoOptions(
+                max_side_px=args.max_side, start_s=args.start, end_s=args.end, fps=args.fps
+            ),
+        )
     sys.stdout.write(json.dumps(done.summary()) + "\n" if args.json else done.as_text())
-    return exit_code(done.outputs, done.video.trajectory)
+    return exit_code(done.outputs, done.video.trajectory, stopped=done.video.stopped)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.atomic import check_output
 from featuredb.cli.common import add_command, open_database
 from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
 from reloc.wire.keys import DEFAULT_ENDPOINT
@@ -136,6 +137,7 @@ def _query(args: argparse.Namespace) -> int:
             "--contribute: expected --credit and --licence, too: whom to name with them, and the terms"
         )
     require_an_image(args.image)
+    _check_overlays(args)
     with Client(args.connect, args.database, config_path=args.config) as client:
 
         def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "tuple[LocaliseReply, None]":
@@ -156,6 +158,7 @@ def _query(args: argparse.Namespace) -> int:
 
 def _localise(args: argparse.Namespace) -> int:
     require_an_image(args.image)
+    _check_overlays(args)
     asker, ask = asking_here(args, lambda: open_database(args), inliers=args.overlay is not None)
     return _answer_all(args, ask, asker.name)
 
@@ -201,6 +204,18 @@ def require_an_image(paths: list[str]) -> None:
         raise InvalidValueError(f"{', '.join(paths)}: expected a photo, found no such file; check the path")
 
 
+def _overlay_of(args: argparse.Namespace, image: Path) -> Path:
+    target: Path = args.overlay
+    if len(args.image) == 1:
+        return target
+    return target.with_name(f"{target.stem}-{image.stem}{target.suffix or '.png'}")
+
+
+def _check_overlays(args: argparse.Namespace) -> None:
+    for image in args.image if args.overlay is not None else ():
+        check_output("--overlay", _overlay_of(args, Path(image)), *args.image)
+
+
 def _answer_all(args: argparse.Namespace, ask: "Ask", database: str) -> int:
     """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
     from reloc.wording import describe
@@ -223,9 +238,7 @@ def _answer_all(args: argparse.Namespace, ask: "Ask", database: str) -> int:
             elif args.overlay is not None:
                 from reloc.overlay import write_overlay
 
-                target = args.overlay
-                if len(args.image) > 1:
-                    target = target.with_name(f"{target.stem}-{path.stem}{target.suffix or '.png'}")
+                target = _overlay_of(args, path)
                 write_overlay(target, data, reply, other_points)
                 sys.stderr.write(f"wrote {target}\n")
         except (OSError, FeatureDbError) as error:

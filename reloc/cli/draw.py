@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.atomic import atomic_file, check_output
 from featuredb.cli.common import open_database
 from featuredb.errors import InvalidValueError
 
@@ -43,10 +44,9 @@ def register(subparsers: Any) -> None:
 
 
 def _draw(args: argparse.Namespace) -> int:
-    from reloc.cli.locate import check_output
     from reloc.pixels.layer import read_layer
 
-    check_output("--out", args.out, args.image)
+    check_output("--out", args.out, args.image, args.layer, args.answer, args.track)
     layer = read_layer(args.layer)
     if args.track is not None:
         return _draw_film(args, layer)
@@ -85,7 +85,8 @@ def _draw(args: argparse.Namespace) -> int:
         done = False
     if not done:
         raise InvalidValueError(f"--out: {suffix} cannot hold {width}x{height} pixels; try .png")
-    args.out.write_bytes(data.tobytes())
+    with atomic_file(args.out) as part:
+        part.write_bytes(data.tobytes())
     sys.stderr.write(f"wrote {args.out}\n")
     return 0
 

@@ -63,7 +63,10 @@ def add_film_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_live(args: argparse.Namespace) -> int:
-    """Stream, print, write; 0, 1 where no frame was localised, 2 where a file could not be written."""
+    """Stream, print, write; 0, 1 where no frame was localised, 2 where a file could not be written or the
+    session ended before the film, 130 where that was stopped.
+    """
+    from featuredb.stop_signals import sigterm_as_ctrl_c
     from featuredb.video.film import VideoOptions
     from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.client.client import Client
@@ -71,9 +74,9 @@ def run_live(args: argparse.Namespace) -> int:
     from reloc.tracking.trajectory.files import check_outputs, exit_code, write_outputs
 
     sys.setswitchinterval(_SWITCH_S)
-    check_outputs(args.out)
+    check_outputs(args.out, args.video)
     camera, prior = parse_camera(args.camera), parse_prior(args.prior)
-    with Client(args.connect, args.database, config_path=args.config) as client:
+    with sigterm_as_ctrl_c(), Client(args.connect, args.database, config_path=args.config) as client:
         found = stream_film(
             client,
             args.video,
@@ -84,7 +87,7 @@ def run_live(args: argparse.Namespace) -> int:
         )
     outputs = write_outputs(args.out, found.trajectory)
     (sys.stderr if args.json else sys.stdout).write(_text(found, outputs.written))
-    return exit_code(outputs, found.trajectory)
+    return exit_code(outputs, found.trajectory, stopped=found.stopped, lost=found.lost)
 
 
 def _as_json(pose: "TrackPose", latency_ms: float | None) -> None:

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.atomic import atomic_file, check_output
 from featuredb.cli.common import numbers, open_database
 from featuredb.errors import InvalidValueError
 
@@ -91,7 +92,7 @@ def _locate(args: argparse.Namespace) -> int:
     if args.answer is None:
         require_an_image([args.image])
     if args.geojson is not None:
-        check_output("--geojson", args.geojson, args.image)
+        check_output("--geojson", args.geojson, args.image, args.answer, args.boxes)
     marks = [MarkedPixel(pixel=pixel) for pixel in args.pixel]
     if args.boxes is not None:
         marks += _boxes(args)
@@ -112,7 +113,8 @@ def _locate(args: argparse.Namespace) -> int:
     for place in places:
         sys.stdout.write(json.dumps(as_json(place)) + "\n" if args.json else _describe(place))
     if args.geojson is not None:
-        args.geojson.write_text(json.dumps(geojson(places, marks, Path(args.image).name), indent=1) + "\n")
+        with atomic_file(args.geojson) as part:
+            part.write_text(json.dumps(geojson(places, marks, Path(args.image).name), indent=1) + "\n")
         sys.stderr.write(f"wrote {args.geojson}\n")
     return _NO_PLACE if any(place.utm is None for place in places) else 0
 
@@ -139,18 +141,6 @@ def _boxes(args: argparse.Namespace) -> "list[MarkedPixel]":
             "not say which its boxes are of; they are taken as those of the stored one, unturned\n"
         )
     return marks
-
-
-def check_output(option: str, path: Path, image: str) -> None:
-    """Before anything is localised: whether an output's folder is there, and it is not the image itself.
-
-    Raises:
-        InvalidValueError: no, or the output is a folder.
-    """
-    if not path.parent.is_dir() or path.is_dir():
-        raise InvalidValueError(f"{option}: expected a file in a folder that is there, found {path}")
-    if path.exists() and Path(image).exists() and path.samefile(image):
-        raise InvalidValueError(f"{option}: expected another file than the image, found {path}")
 
 
 def answered_view(

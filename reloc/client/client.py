@@ -22,6 +22,7 @@ from reloc.client.connection import (
 )
 from reloc.client.fleet import ANY, WHOLE, Fleet, best_supported
 from reloc.client.live import LiveTrack
+from reloc.configuration import read_configuration
 from reloc.wire.keys import ANONYMOUS, DEFAULT_ENDPOINT, Keys
 from reloc.wire.query import (
     CameraRequest,
@@ -91,6 +92,7 @@ class Client:
 
         Raises:
             ServiceError: NO_SERVER, nobody at the endpoint, or no (or not exactly one) database.
+            InvalidValueError: the configuration cannot be read.
         """
         session = self._open_session or self._connected()
         try:
@@ -102,13 +104,12 @@ class Client:
         self._open_session = session
 
     def _connected(self) -> zenoh.Session:
+        config = None
+        if self._config_path is not None:
+            config = read_configuration(self._config_path)
+            self.name = name_in(config)
         try:
-            if self._config_path is not None:
-                config = zenoh.Config.from_file(str(self._config_path))
-                self.name = name_in(config)
-            else:
-                config = client_config(self._connect, self._connect_timeout_s)
-            return zenoh.open(config)
+            return zenoh.open(config or client_config(self._connect, self._connect_timeout_s))
         except zenoh.ZError as error:
             asked = "is `featuredb serve` running, and is this its --listen endpoint?"
             raise ServiceError(NO_SERVER, f"nobody answers at {self._where}; {asked}") from error

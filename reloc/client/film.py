@@ -17,7 +17,7 @@ from featuredb.video.opening import Source
 from reloc.answered_view import geopose_of
 from reloc.client.client import Client
 from reloc.client.live import LiveTrack
-from reloc.tracking.film_end import until_it_ends
+from reloc.tracking.film_end import STOPPED, until_it_ends
 from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from reloc.wire.query import CameraRequest, PriorRequest
@@ -42,7 +42,9 @@ class StreamedFilm:
     sent: int  # of them
     latency_ms: FloatArray  # (n,) from sending a frame to its pose, of the answered ones
     refusals: tuple[str, ...]  # why frames could not be used, the latest
-    complaints: tuple[str, ...]  # what was wrong with the film, and why the session ended before it
+    complaints: tuple[str, ...]  # what was wrong with the film
+    stopped: bool  # by hand, before the end of a film that has one
+    lost: str  # why the session ended before the film; empty where it did not
 
 
 class _Answers:
@@ -121,6 +123,7 @@ def stream_film(
     """
     options = options or VideoOptions(max_side_px=SENT_SIDE_PX)
     trouble: list[str] = []
+    lost = ""
     sent, last, last_sent = 0, -1, -1
     with (
         open_video(source, options) as video,
@@ -143,7 +146,7 @@ def stream_film(
                     sent, last_sent = sent + 1, frame.index
             answers.await_frame(last_sent)
         except ServiceError as error:
-            trouble.append(f"the session ended: {error}")
+            lost = f"the session ended: {error}"
         refusals = tuple(f"frame {event.sequence}: {event.message}" for event in live.refusals)
         complaints = (*trouble, *video.report.complaints())
     if last < 0:
@@ -155,4 +158,6 @@ def stream_film(
         latency_ms=np.array(answers.latency_ms),
         refusals=refusals,
         complaints=complaints,
+        stopped=STOPPED in trouble and not info.live,
+        lost=lost,
     )

@@ -9,6 +9,7 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from reloc import listening
+from reloc.configuration import read_configuration
 from reloc.gateway.app import create_app
 from reloc.gateway.options import GatewayOptions
 from reloc.wire.keys import is_loopback
@@ -74,7 +75,13 @@ def uvicorn_server(options: GatewayOptions) -> uvicorn.Server:
 
 
 def serve(options: GatewayOptions, on_ready: Callable[[str], None] = lambda url: None) -> None:
-    """Serve until SIGINT or SIGTERM; call from the main thread. Raises ListenError: cannot listen."""
+    """Serve until SIGINT or SIGTERM; call from the main thread.
+
+    Raises:
+        ListenError: cannot listen. InvalidValueError: the configuration cannot be read.
+    """
+    if options.config_path is not None:
+        read_configuration(options.config_path)  # each question would be answered by its error
     listening.run(
         uvicorn_server(options), partial(listen, options), lambda url: on_ready(url + options.prefix)
     )

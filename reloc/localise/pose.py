@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.stop_signals import handle_as_before
 from reloc.localise.lens_prior import LensPriors, QueryLensPrior, pixel_jacobians
 from reloc.localise.options import PoseOptions
 from reloc.localise.self_calibration import calibrate, covariance_from_information
 from reloc.wire.query import CameraSource
+
+handle_as_before()  # pycolmap's glog has put a handler there that prints a stack trace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

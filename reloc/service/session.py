@@ -11,6 +11,7 @@ import zenoh
 from pydantic import BaseModel
 
 from featuredb.errors import FeatureDbError
+from reloc.configuration import first_sentence, read_configuration
 from reloc.service.logs import fields
 from reloc.wire.keys import DEFAULT_ENDPOINT, is_loopback
 from reloc.wire.query import encode
@@ -32,14 +33,9 @@ def server_config(
     """The Zenoh configuration of a server; one that connects listens only where `listen` says so.
 
     Raises:
-        ServiceStartError: the file cannot be read.
+        InvalidValueError: the file cannot be read.
     """
-    try:
-        config = zenoh.Config() if config_path is None else zenoh.Config.from_file(str(config_path))
-    except zenoh.ZError as error:
-        raise ServiceStartError(
-            f"cannot read the Zenoh configuration {config_path}: {_first_sentence(error)}"
-        ) from error
+    config = zenoh.Config() if config_path is None else read_configuration(config_path)
     if config_path is None:
         config.insert_json5("mode", '"peer"')
         # Without a configuration file the server is where it says it is and searches for nobody.
@@ -68,7 +64,7 @@ def open_server_session(config: zenoh.Config, where: str) -> zenoh.Session:
         hint = "is another server running there? Choose another port with --listen tcp/HOST:PORT"
         if "in use" not in str(error):
             hint = f"expected endpoints like {DEFAULT_ENDPOINT}"
-        raise ServiceStartError(f"cannot listen on {where}: {_first_sentence(error)}; {hint}") from error
+        raise ServiceStartError(f"cannot listen on {where}: {first_sentence(error)}; {hint}") from error
 
 
 def publish(
@@ -96,11 +92,6 @@ def bind_free_port(endpoint: str) -> str:
         raise ServiceStartError(
             f"cannot listen on {endpoint}: {error}; expected endpoints like {DEFAULT_ENDPOINT}"
         ) from error
-
-
-def _first_sentence(error: Exception) -> str:
-    """Zenoh's message without the source lines that it appends."""
-    return str(error).split(" at /")[0].strip()
 
 
 def check_exposure(config: zenoh.Config) -> None:

@@ -6,6 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ from featuredb.video.frames import open_video
 from featuredb.video.opening import Source
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.localise.result import LocaliseRequest
-from reloc.tracking.film_end import until_it_ends
+from reloc.tracking.film_end import STOPPED, until_it_ends
 from reloc.tracking.ground import Finder, TrackedFrame
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import Tracker
@@ -125,6 +126,48 @@ class TrackedVideo:
     camera: Camera | None  # of the frames as they were tracked; None where nothing was localised
     seconds: dict[str, float]  # `total`; of it `tracking`, `drawing` and `waiting` for frames
     complaints: tuple[str, ...]  # what was wrong with the film, for people
+    stopped: bool = False  # by hand, before the end of a film that has one
+    undrawn: str = ""  # why there is no overlay, where one was asked for
+
+
+class _Overlay:
+    """The film with the track drawn over it; where it can be written no more, tracking goes on without."""
+
+    def __init__(self, path: Path | None, info: VideoInfo) -> None:
+        self.undrawn = ""
+        self._first_s: float | None = None
+        self._writer = path and VideoWriter(
+            path,
+            width=info.frame_width // 2 * 2,
+            height=info.frame_height // 2 * 2,
+            fps=None,
+            options=VideoWriterOptions(crf=23, preset="veryfast"),
+        )
+
+    def __enter__(self) -> Self:
+        if self._writer:
+            self._writer.__enter__()
+        return self
+
+    def write(self, frame: VideoFrame, tracked: TrackedFrame, point: TrajectoryPoint) -> bool:
+        """Whether the frame was drawn."""
+        if not self._writer:
+            return False
+        self._first_s = frame.time_s if self._first_s is None else self._first_s
+        picture = draw_frame(frame.rgb(), tracked, point)[: self._writer.height, : self._writer.width]
+        try:
+            self._writer.write(picture, frame.time_s - self._first_s)
+        except VideoError as error:
+            self._writer.__exit__(type(error), error, error.__traceback__)
+            self._writer, self.undrawn = None, str(error)
+        return True
+
+    def __exit__(self, *failed: Any) -> None:
+        try:
+            if self._writer:
+                self._writer.__exit__(*failed)
+        except VideoError as error:
+            self.undrawn = str(error)
 
 
 def track_video(
@@ -142,7 +185,7 @@ def track_video(
     a little later, too.
 
     Raises:
-        VideoError: the film cannot be read at all, or has no frames; the overlay cannot be written. Where it
+        VideoError: the film cannot be read at all, or has no frames; the overlay cannot be begun. Where it
             breaks off, or is stopped by Ctrl-C, what was tracked until then is the result.
         InvalidValueError: the camera is of another shape than the film.
     """
@@ -160,18 +203,7 @@ def track_video(
             lens = None if camera is None else camera.scaled_to(info.frame_width, info.frame_height)
             request = _with_film(request or LocaliseRequest(), info, source)
             tracker = stack.enter_context(Tracker(finder, lens, options.track, request))
-            writer = None
-            if overlay is not None:
-                writer = stack.enter_context(
-                    VideoWriter(
-                        overlay,
-                        width=info.frame_width // 2 * 2,
-                        height=info.frame_height // 2 * 2,
-                        fps=None,
-                        options=VideoWriterOptions(crf=23, preset="veryfast"),
-                    )
-                )
-            first_s: float | None = None
+            drawn = stack.enter_context(_Overlay(overlay, info))
             frames = stack.enter_context(closing(read_ahead(video, lambda: not tracker.busy)))
             clock.lap("tracking")
             for frame in until_it_ends(frames, trouble):
@@ -181,10 +213,7 @@ def track_video(
                 points.append(point)
                 _filled(points, tracker.late)
                 clock.lap("tracking")
-                if writer is not None:
-                    first_s = frame.time_s if first_s is None else first_s
-                    picture = draw_frame(frame.rgb(), tracked, point)
-                    writer.write(picture[: writer.height, : writer.width], frame.time_s - first_s)
+                if drawn.write(frame, tracked, point):
                     clock.lap("drawing")
             if not points:
                 raise info.no_frames()
@@ -205,6 +234,8 @@ def track_video(
             "drawing": seconds.get("drawing", 0.0),
         },
         complaints=complaints,
+        stopped=STOPPED in trouble and not info.live,
+        undrawn=drawn.undrawn,
     )
 
 

@@ -157,7 +157,7 @@ def test_mistakes_end_before_the_photo_is_read(
         ([], "--pixel U,V or --boxes"),
         (["--pixel", "1;2"], "expected U,V"),
         (["--pixel", "1,2", "--scan-sigma=-1"], "--scan-sigma"),
-        (["--pixel", "1,2", "--geojson", "no/folder.geojson"], "--geojson"),
+        (["--pixel", "1,2", "--geojson", "photo.png/place.geojson"], "--geojson"),
     ):
         assert main([*base, *words]) == 2
         assert said in capsys.readouterr().err
@@ -201,9 +201,9 @@ def test_a_drawing_replaces_no_photo_and_is_of_the_photo_that_was_answered(
     before = (folder / "photo.png").read_bytes()
     with only_command(monkeypatch, "draw", "reloc.cli.draw:register"):
         for photo, out, said in (
-            ("photo.png", "./photo.png", "expected another file than the image"),
+            ("photo.png", "./photo.png", "expected another file than photo.png"),
             ("photo.png", "drawn.xyz", "expected a picture such as"),
-            ("photo.png", "no/drawn.png", "in a folder that is there"),
+            ("photo.png", "photo.png/drawn.png", "in a folder that can be written"),
             ("missing.png", "drawn.jpg", "expected a photo"),
             ("turned/photo.png", "drawn.jpg", "of the shape of 640x480 pixels, found 480x640"),
         ):

@@ -75,9 +75,49 @@ MISTAKES = {
         "query photos/a.jpg --connect tcp/127.0.0.1:{port}",
         r"nobody answers at tcp/127.0.0.1:\d+; is `featuredb serve` running, and is this its --listen",
     ),
+    "a configuration that is not there": (
+        "query photos/a.jpg --config missing.json5",
+        r"--config: expected a Zenoh configuration .* in missing.json5, found: No such file .* keys",
+    ),
+    "a configuration that is cut off": (
+        "live film.mp4 --config cut.json5",
+        r"--config: .* in cut.json5, found: at 1:7 expected array",
+    ),
+    "a gateway by an empty configuration": (
+        "gateway --port 0 --config empty.json5",
+        r"--config: .* in empty.json5, found: Empty config file; ",
+    ),
+    "a configuration that is a picture": (
+        "query photos/a.jpg --config photos/a.jpg",
+        r"--config: .* in photos/a.jpg, found: stream did not contain valid UTF-8",
+    ),
     "an output that exists": (
         "export field.db texts --format colmap",
         r"texts: expected a name that is free, or an empty folder; nothing is overwritten",
+    ),
+    "a drawing over the photo": (
+        "localise field.db photos/a.jpg --overlay photos/../photos/a.jpg",
+        r"--overlay: expected another file than photos/a.jpg, which is read",
+    ),
+    "a server's drawing over a photo": (
+        "query overlay-a.png photos/a.jpg --overlay overlay.png",
+        r"--overlay: expected another file than overlay-a.png",
+    ),
+    "a film over the film": (
+        "track field.db film.mp4 --out track.csv --overlay link.mp4",
+        r"--overlay: expected another file than film.mp4, which is read, found link.mp4",
+    ),
+    "a track over the film": (
+        "track field.db film.mp4 --out link.csv",
+        r"--out: expected another file than film.mp4, which is read, found link.csv",
+    ),
+    "a track over the first pose": (
+        "track field.db film.mp4 --pose pose.json --out pose.json",
+        r"--out: expected another file than pose.json, which is read",
+    ),
+    "a track in place of a folder": (
+        "track field.db film.mp4 --out folder.csv",
+        r"--out: expected a file in a folder that can be written, found the folder folder.csv",
     ),
     "frames without times": (
         "track field.db photos --out track.csv",
@@ -112,6 +152,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "texts" / "a.txt").write_text("no photo")
     (here / "film.gif").write_bytes(b"GIF89a and so on")
     film(here, "mp4")
+    (here / "overlay-a.png").write_text("no photo")
+    for name, text in (("pose.json", ""), ("empty.json5", ""), ("cut.json5", "{mode:")):
+        (here / name).write_text(text)
+    for name in ("link.mp4", "link.csv"):
+        (here / name).symlink_to("film.mp4")
+    (here / "folder.csv").mkdir()
     scan = laspy.LasData(laspy.LasHeader(point_format=1, version="1.2"))
     place = np.array([456_800.0, 5_429_300.0, 100.0]) + np.random.default_rng(0).uniform(0, 50, (100, 3))
     scan.x, scan.y, scan.z = place.T

@@ -2,12 +2,14 @@
 
 import csv
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from featuredb.cli.main import main
+from featuredb.errors import VideoError
 from featuredb.video.frames import open_video
 from featuredb.video.writer import VideoWriter
 from tests.support.hill_photos import CAMERA, FRAME, _render
@@ -113,6 +115,28 @@ def test_bad_requests_say_what_is_wrong_and_write_nothing(
     assert main(["track", str(anchored), str(folder / "film.mp4"), *change, *overlay]) not in (0, 1)
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_drawn_is_tracked(
+    anchored: Path,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A disk that is full, and a hand that ends the film."""
+
+    def full(*_: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        raise VideoError("o.mp4: the film cannot be written: No space left on device")
+
+    monkeypatch.setattr(VideoWriter, "write", full)
+    words = ["--out", str(tmp_path / "t.csv"), "--overlay", str(tmp_path / "o.mp4")]
+    assert main(["track", str(anchored), str(folder / "film.mp4"), *words]) == 2
+    said = capsys.readouterr().err
+    assert "o.mp4: the film cannot be written" in said
+    assert "stopped by hand; what was written is a part" in said
+    assert [file.name for file in tmp_path.iterdir()] == ["t.csv"]
 
 
 def test_a_broken_film_says_so_and_writes_nothing(

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from featuredb.errors import VideoError
+from featuredb.stop_signals import sigterm_as_ctrl_c
 from reloc.tracking.film_end import until_it_ends
 
 
@@ -48,13 +49,15 @@ def _raising() -> Iterator[int]:
     yield 0
 
 
-def test_a_frame_in_hand_is_the_last_one_after_ctrl_c() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_frame_in_hand_is_the_last_one_after_ctrl_c(number: signal.Signals) -> None:
     trouble: list[str] = []
     worked = []
-    for frame in until_it_ends(film(), trouble):
-        if frame == 1:
-            signal.raise_signal(signal.SIGINT)
-        worked.append(frame)
+    with sigterm_as_ctrl_c():
+        for frame in until_it_ends(film(), trouble):
+            if frame == 1:
+                signal.raise_signal(number)
+            worked.append(frame)
     assert (worked, trouble) == ([0, 1], ["stopped by hand"])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

@@ -74,6 +74,8 @@ def test_the_table_has_the_pose_under_names_of_its_own(tmp_path: Path) -> None:
 def test_a_track_without_a_place_counts_as_found_and_says_so(tmp_path: Path) -> None:
     written = write_outputs([tmp_path / "t.csv"], _TRACK)
     assert exit_code(written, _TRACK) == 0
+    assert exit_code(written, _TRACK, stopped=True) == 130
+    assert exit_code(written, _TRACK, lost="the session ended: NO_SERVER") == 2
     assert _TRACK.times_found() == [(0.0, 0.0), (0.08, 0.08)]
     assert "no place on Earth" in _words(_TRACK.points[0])[1]
 

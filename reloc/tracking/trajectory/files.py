@@ -7,7 +7,6 @@ map without a place is CSV only, with columns of other names, so that nobody tak
 import csv
 import io
 import json
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from featuredb.atomic import atomic_file
+from featuredb.atomic import atomic_file, check_output
 from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.geo.geopose import geopose_from_camera, irregular_series
 from featuredb.geo.local_frame import LocalFrame
@@ -29,7 +28,8 @@ from reloc.tracking.ground import EarthPose
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
 from reloc.wire.track import TrackState
 
-_NOTHING_FOUND, _FAILED = 1, 2  # exit codes: no frame was localised; a file could not be written
+# Exit codes: no frame was localised; a file could not be written, or the server was lost; stopped by hand.
+_NOTHING_FOUND, _FAILED, _STOPPED = 1, 2, 130
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 
 
@@ -60,17 +60,15 @@ class Outputs:
     failed: tuple[str, ...]
 
 
-def check_outputs(files: Sequence[Path]) -> None:
+def check_outputs(files: Sequence[Path], *sources: str | Path | None) -> None:
     """Before an hour of tracking, not after it.
 
     Raises:
-        InvalidValueError: a suffix that stands for no format, or a folder that cannot be written.
+        InvalidValueError: a suffix that stands for no format; or as `check_output`.
     """
     for file in files:
         format_of(file)
-        folder = next(folder for folder in file.absolute().parents if folder.exists())
-        if not folder.is_dir() or not os.access(folder, os.W_OK):
-            raise InvalidValueError(f"{file}: expected a folder that can be written, found {folder}")
+        check_output("--out", file, *sources)
 
 
 def write_outputs(files: Sequence[Path], trajectory: Trajectory) -> Outputs:
@@ -84,16 +82,25 @@ def write_outputs(files: Sequence[Path], trajectory: Trajectory) -> Outputs:
             write_trajectory(file, trajectory)
             written.append(str(file))
         except (FeatureDbError, OSError) as error:
-            failed.append(f"{file}: {error}")
+            failed.append(f"{file}: {getattr(error, 'strerror', None) or error}")
     return Outputs(written=tuple(written), failed=tuple(failed))
 
 
-def exit_code(outputs: Outputs, trajectory: Trajectory) -> int:
-    """0, 1 where no frame was localised, 2 where a file could not be written; stderr says which."""
-    for text in outputs.failed:
+def exit_code(outputs: Outputs, trajectory: Trajectory, *, stopped: bool = False, lost: str = "") -> int:
+    """0, 1 where no frame was localised, 2 where something failed, 130 where a film was stopped; stderr says.
+
+    Args:
+        stopped: a film ended by hand before its end. lost: why a server did not go on to the end.
+    """
+    part = "what was written is a part of the film, up to there"
+    for text in (*outputs.failed, *([f"{lost}; {part}"] if lost else [])):
         sys.stderr.write(f"featuredb: {text}\n")
-    if outputs.failed:
+    if stopped:
+        sys.stderr.write(f"featuredb: stopped by hand; {part}\n")
+    if outputs.failed or lost:
         return _FAILED
+    if stopped:
+        return _STOPPED
     return 0 if any(point.found for point in trajectory.points) else _NOTHING_FOUND
 
 
