@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.atomic import file_sha256
+from featuredb.errors import VideoError
 from featuredb.features.exif.read import unnamed_model
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
