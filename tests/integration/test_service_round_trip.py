@@ -208,7 +208,7 @@ def test_a_defect_of_the_localiser_costs_one_query_and_its_details_stay_in_the_l
             "4",
         ),
         (
-            b'{"camera": {"model": "PINHOLE", "width": 1600, "height": 900, "params": [9, 9, 3, 3]}}',
+            b'{"camera": {"model": "PINHOLE", "width": 1600, "height": 900, "params": [900, 900, 3, 3]}}',
             "BAD_REQUEST",
             "aspect",
         ),
@@ -218,19 +218,19 @@ def test_a_defect_of_the_localiser_costs_one_query_and_its_details_stay_in_the_l
             "LENS",
         ),
         (
-            b'{"camera": {"model": "PINHOLE", "width": 1600, "height": 1200, "params": [9, 9, 3, 3],'
+            b'{"camera": {"model": "PINHOLE", "width": 1600, "height": 1200, "params": [900, 900, 3, 3],'
             b' "sigmas": [1, 1, 1, 1]}}',
             "BAD_REQUEST",
             "camera.sigmas: expected the parameters of a SIMPLE_RADIAL or an OPENCV lens, found PINHOLE",
         ),
         (
-            b'{"camera": {"model": "SIMPLE_RADIAL", "width": 1600, "height": 1200, "params": [9, 3, 3, 0],'
+            b'{"camera": {"model": "SIMPLE_RADIAL", "width": 1600, "height": 1200, "params": [900, 3, 3, 0],'
             b' "sigmas": [1, 1, 1, 1, 1]}}',
             "BAD_REQUEST",
             "camera.sigmas: known_within: expected 4 sigmas",
         ),
         (
-            b'{"camera": {"model": "SIMPLE_RADIAL", "width": 1600, "height": 1200, "params": [9, 3, 3, 0],'
+            b'{"camera": {"model": "SIMPLE_RADIAL", "width": 1600, "height": 1200, "params": [900, 3, 3, 0],'
             b' "sigmas": [1, 1, -1, 1]}}',
             "BAD_REQUEST",
             "camera.sigmas",
