@@ -9,14 +9,13 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.anchor.ground.scan_shape import CELL_M, Circle, ScanShape
+from ingest.register.anchor.ground.scan_shape import CELL_M, HIGH_M, Circle, ScanShape
 from ingest.register.anchor.ground.street_plan import StreetPlan
 from ingest.register.anchor.start.from_ortho import PlanTry, first_apart
 
 _CELL_M = 1.0
 _BLUR_CELLS = 1.0
 _REACH_CELLS = 60  # of a plan from the middle of its cameras
-_HIGH_M = 2.5  # over the ground: nobody looks through it
 _FREE_WEIGHT = 0.1  # of a square metre of view through a building, over a metre of front
 TURN_STEP, SIZE_STEP = np.radians(6.0), 0.1  # of the heading, of the size's logarithm
 _PEAKS = 3  # of each heading and size
@@ -76,7 +75,7 @@ class PlanSearch:
         self._corner, self._shape = shape.corner, (rows, columns)
         self._padded = [fft.next_fast_len(n + 2 * _REACH_CELLS, real=True) for n in self._shape]
         part = np.s_[: rows * step, : columns * step]
-        high = (shape.top - shape.ground > _HIGH_M)[part].reshape(rows, step, columns, step).mean(axis=(1, 3))
+        high = (shape.top - shape.ground > HIGH_M)[part].reshape(rows, step, columns, step).mean(axis=(1, 3))
         self._known = shape.known[part].reshape(rows, step, columns, step).mean(axis=(1, 3)) > 0.5
         at = np.floor((shape.walls[:, :2] - shape.corner) / _CELL_M).astype(np.int64)
         inside = ((at >= 0) & (at < np.array([columns, rows]))).all(axis=1)
