@@ -260,7 +260,7 @@ def test_a_lens_that_folds_is_refused(world: ScannedMap, monkeypatch: pytest.Mon
     bad = replace(world.feature_map, cameras=(folding,))
     registered = {4: world.registered(4, correspondences=150)}
     structure = project_structure(world.feature_map, registered, world.cloud)
-    monkeypatch.setattr(f"{_ADJUSTMENT}._LENS", _STIFF)
+    monkeypatch.setattr(f"{_ADJUSTMENT}.lens_prior_of", lambda camera, *_: lens_prior(camera, _STIFF))
     monkeypatch.setattr(f"{_ADJUSTMENT}._ROUNDS", 1)
     monkeypatch.setattr(f"{_ADJUSTMENT}._STEPS", 1)
     assert adjust_to_scan(bad, structure, registered, world.cloud).reason == "LENS"

@@ -14,7 +14,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
-from featuredb.features.exif.read import ExifInfo, parse_exif, read_exif
+from featuredb.features.exif.read import ExifInfo, focal_of_key, parse_exif, read_exif
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.maps.feature_map import prior_from_exif
 
@@ -319,6 +319,14 @@ def test_camera_key_tells_zoom_positions_and_bodies_apart() -> None:
     ]
     assert len({photo.camera_key, *(other.camera_key for other in others)}) == 6
     assert replace(photo, make="", model=" ").camera_key == ""
+
+
+def test_a_camera_key_tells_its_focal_length() -> None:
+    photo = ExifInfo(make="Maker", model="5x5|f9", width=4000, height=3000, focal_px=2311.4)
+    assert focal_of_key(photo.camera_key) == 2310.0
+    assert focal_of_key(replace(photo, serial="77", resaved=True).camera_key) == 2310.0
+    assert focal_of_key(replace(photo, model="M", focal_px=None).camera_key) is None
+    assert focal_of_key("") is None
 
 
 def test_photos_that_a_program_saved_anew_are_a_camera_of_their_own() -> None:

@@ -58,6 +58,7 @@ _XMP_VALUE = re.compile(
 # How the lenses of films are named that do not say their camera: by the film's bytes, and the shot.
 UNNAMED_MAKE = "film"
 _SHOT = "shot"
+_FOCAL_IN_KEY = re.compile(r"\|\d+x\d+\|f(\d+)(\||$)")
 _SOFTWARE = "featuredb"  # of EXIF, in pictures of films
 
 
@@ -75,6 +76,12 @@ def is_of_film(camera_key: str, film: str) -> bool:
     """Whether an `ExifInfo.camera_key` is of some shot of a film's model."""
     start = f"{UNNAMED_MAKE}|{film}".lower()
     return camera_key.startswith((f"{start}|", f"{start} {_SHOT} "))
+
+
+def focal_of_key(camera_key: str) -> float | None:
+    """Focal length in pixels that an `ExifInfo.camera_key` names, three digits of it; None for none."""
+    named = _FOCAL_IN_KEY.search(camera_key)
+    return None if named is None else float(named[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

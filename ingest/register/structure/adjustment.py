@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import Block, LensWidths, Marks, Terms, lens_prior, surface_priors, whole_lens
+from featuredb.adjust.terms import Block, LensPrior, Marks, Terms, surface_priors, whole_lens
+from featuredb.features.exif.read import focal_of_key
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -20,7 +21,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from featuredb.render.cloud import PointCloud
-from ingest.colmap.adjust import AdjustOptions, longest_side, residuals_of
+from ingest.colmap.adjust import AdjustOptions, lens_prior_of, longest_side, residuals_of
 from ingest.colmap.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.outcome import Outcome
@@ -32,11 +33,8 @@ _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
 # side: a pixel in 4000. Trusted to their noise, thousands of tracks outvote the frames' correspondences.
 _MIN_SIGMA_REL = 0.00025
 _MIN_SURFACE_M = 0.03  # of a scan's surface against map points; roughness of grass and pavement
-# Structure from motion over flat ground was 25 % off on `brighton`; most lenses are centred, pixels square.
-_LENS = LensWidths(focal_rel=0.3, aspect_rel=0.002, center_rel=0.02, radial=0.1, tangential=0.003)
-# What lenses leave open counts so many times in the poses' covariances
-# (`ingest.colmap.adjust.AdjustOptions.dilution`, measured there).
-_LENS_DILUTION = AdjustOptions().dilution
+# What is known of lenses, and how many times what they leave open counts in the poses' covariances.
+_MAPPING = AdjustOptions()
 _ROUNDS = 25  # of looking up the scan's planes; it ends earlier when points move by less than _SETTLED_M
 _STEPS = 8  # of the solver in each round
 _SETTLED_M = 1e-3  # see above; far below a scan's noise
@@ -97,15 +95,20 @@ def adjust_to_scan(
     if surface is None:
         return LidarAdjustment(reason="NO_SCAN", message="the scan has no points under the map")
     first = start if begin is None else block_of_map(begin).moved(to_cloud)
-    block = _iterate(first, start.cameras, control, surface)
+    keys = feature_map.camera_keys or ("",) * len(start.cameras)
+    lenses = tuple(
+        lens_prior_of(camera, focal_of_key(key), _MAPPING)
+        for camera, key in zip(start.cameras, keys, strict=True)
+    )
+    block = _iterate(first, lenses, control, surface)
     before, after = (_state(one, surface) for one in (start, block))
     figures: dict[str, Any] = {"before": before, "after": after, "own": _own_spread(block, control)}
     reason, message = _gate(block, figures)
     if reason == "LENS":
         return LidarAdjustment(reason=reason, message=message, figures=figures)
-    poses, lenses = _left_open(block, control, surface, structure, start)
+    poses, uncertainty = _left_open(block, lenses, control, surface, structure)
     return LidarAdjustment(
-        reason=reason, message=message, block=block, poses=poses, lenses=lenses, figures=figures
+        reason=reason, message=message, block=block, poses=poses, lenses=uncertainty, figures=figures
     )
 
 
@@ -153,11 +156,11 @@ def _control_of(feature_map: FeatureMap, registered: Registered) -> Marks:
     )
 
 
-def _iterate(start: Block, lenses: tuple[Camera, ...], control: Marks, surface: Surface) -> Block:
+def _iterate(start: Block, lenses: tuple[LensPrior, ...], control: Marks, surface: Surface) -> Block:
     """Rounds of planes, standard deviations and solving until points and cameras settle."""
     block = start
     for _ in range(_ROUNDS):
-        problem = Problem(block, _terms(block, control, surface, lenses, _MIN_SIGMA_REL, _MIN_SURFACE_M))
+        problem = Problem(block, _terms(block, lenses, control, surface, _MIN_SIGMA_REL, _MIN_SURFACE_M))
         problem.solve(_STEPS, _FUNCTION_TOLERANCE)
         before, block = block, problem.block()
         points_m = np.median(np.linalg.norm(block.xyz - before.xyz, axis=1))
@@ -169,9 +172,9 @@ def _iterate(start: Block, lenses: tuple[Camera, ...], control: Marks, surface: 
 
 def _terms(
     block: Block,
+    lenses: tuple[LensPrior, ...],
     control: Marks,
     surface: Surface,
-    lenses: tuple[Camera, ...],
     least_rel: float,
     least_m: float,
 ) -> Terms:
@@ -184,27 +187,33 @@ def _terms(
     control_px = max(least_px, _spread(_control_residuals(block, control)[0]))
     return Terms(
         keypoint_px=max(least_px, _spread(residuals_of(block)[0])),
-        lenses=tuple(lens_prior(camera, _LENS) for camera in lenses),
+        lenses=lenses,
         marks=replace(control, sigma_px=control_px),
         points=surface_priors(block.xyz, offset, normals, max(least_m, _spread(offset))),
     )
 
 
 def _left_open(
-    block: Block, control: Marks, surface: Surface, structure: StructurePlacement, start: Block
+    block: Block,
+    lenses: tuple[LensPrior, ...],
+    control: Marks,
+    surface: Surface,
+    structure: StructurePlacement,
 ) -> tuple[tuple[FloatArray, ...], LensUncertainty | None]:
     """(6, 6) of each pose with all that points and lenses leave open, and what is left open of the lenses.
 
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
     or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
+    What is known of lenses beforehand does not: so many times more it weighs.
     """
-    found = Problem(block, _terms(block, control, surface, start.cameras, 1e-6, 1e-3)).marginals()
     shared = design_effect(*residuals_of(block), longest_side(block.cameras))
     factor = max(float(structure.figures["neighbours_factor"]), shared)
-    lenses = [factor * _LENS_DILUTION * found.lens(c) for c in range(len(block.cameras))]
+    terms = _terms(block, lenses, control, surface, 1e-6, 1e-3)
+    found = Problem(block, replace(terms, dilution=factor * _MAPPING.dilution)).marginals()
+    open_lenses = [factor * _MAPPING.dilution * found.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
-    uncertainty = uncertainty_of_lenses(block.cameras, lenses, photos, _LENS_DILUTION)
-    return tuple(factor * found.poses(_LENS_DILUTION)), uncertainty
+    uncertainty = uncertainty_of_lenses(block.cameras, open_lenses, photos, _MAPPING.dilution)
+    return tuple(factor * found.poses(_MAPPING.dilution)), uncertainty
 
 
 def _spread(residuals: FloatArray) -> float:
