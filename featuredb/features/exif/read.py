@@ -58,7 +58,7 @@ _XMP_VALUE = re.compile(
 # How the lenses of films are named that do not say their camera: by the film's bytes, and the shot.
 UNNAMED_MAKE = "film"
 _SHOT = "shot"
-_FOCAL_IN_KEY = re.compile(r"\|\d+x\d+\|f(\d+)(\||$)")
+_FOCAL_IN_KEY = re.compile(r".*\|\d+x\d+\|f(\d+)(\||$)")
 _SOFTWARE = "featuredb"  # of EXIF, in pictures of films
 
 
@@ -80,7 +80,7 @@ def is_of_film(camera_key: str, film: str) -> bool:
 
 def focal_of_key(camera_key: str) -> float | None:
     """Focal length in pixels that an `ExifInfo.camera_key` names, three digits of it; None for none."""
-    named = _FOCAL_IN_KEY.search(camera_key)
+    named = _FOCAL_IN_KEY.match(camera_key)
     return None if named is None else float(named[1])
 
 
