@@ -181,8 +181,8 @@ class Localiser:
             for m in placed
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
-        files.prune()
         indexed = dict(zip(loaded, indexed_together(list(loaded.values()), before.areas), strict=True))
+        files.settle()
         made = cls(indexed, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
         made._states = {m.write_id: states[m.write_id] for m in active if m.write_id in states}
         return made
@@ -307,9 +307,9 @@ def _load(
 
 def _load_alone(url: str, snapshot: Snapshot, summary: MapSummary) -> IndexedArea:
     files = SegmentFiles(url)
-    area = _load(files, snapshot, [summary], {}, {})
-    files.prune()
-    return indexed_together([area])[0]
+    indexed = indexed_together([_load(files, snapshot, [summary], {}, {})])[0]
+    files.settle()
+    return indexed
 
 
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:

@@ -123,12 +123,18 @@ class Area:
             found.append((np.flatnonzero(marked) + self.point_start[number]).astype(np.int32))
         return np.concatenate(found)
 
-    def sums_over_sights(self, of_point: FloatArray) -> FloatArray:
-        """(i,) sums, over the points that each image sees, of what they have (p,)."""
+    def sums_over_sights(self, rows: NDArray[np.int64], of_point: FloatArray) -> FloatArray:
+        """(i,) sums, over the points that each image sees, of what some points have.
+
+        Args:
+            rows: (k,) of points, ascending, without repetition. of_point: (k,).
+        """
         sums = np.zeros(len(self.image_map))
-        for number in np.unique(self.point_map[np.flatnonzero(of_point)]):
-            segment = self.segments[number]
-            own = of_point[slice(*self.point_start[number : number + 2])]
+        for number in np.unique(self.point_map[rows]):
+            segment, start = self.segments[number], self.point_start[number : number + 2]
+            mine = slice(*np.searchsorted(rows, start))
+            own = np.zeros(len(segment))
+            own[rows[mine] - start[0]] = of_point[mine]
             until = np.concatenate([[0.0], np.cumsum(own[segment.see_point])])
             sums[slice(*self.image_start[number : number + 2])] = np.diff(until[segment.image_start])
         return sums
@@ -213,7 +219,7 @@ def join_segments(
     area_from_maps = [frame.enu_from(m.frame) for m in maps]
     parts = list(zip(area_from_maps, segments, strict=True))
     turns = np.array([move.rotation for move in area_from_maps])
-    shifts = np.array([move.translation for move in area_from_maps])
+    shifts = np.concatenate([move.act(segment.origin) for move, segment in parts])
     points = np.array([len(segment) for segment in segments])
     images = np.array([len(segment.image_center) for segment in segments])
     scene = np.concatenate([move.act(s.image_scene) for move, s in parts])

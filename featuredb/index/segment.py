@@ -21,10 +21,11 @@ class Segment:
     """Arrays of p points and i images, by convention read-only; lengths in metres, in the map's local frame.
 
     Attributes:
-        points: (p, 3) float64.
+        origin: (1, 3) float64, in the middle of the points.
+        points: (p, 3) float32, from there; of a map 10 km wide they are rounded by half a millimetre.
         point_row: (p,) int32, row in the map's MapPoints, ascending.
         covariance: (p, 6) float32, as in MapPoints.
-        view_direction: (p, 3) float32, mean unit vector from the point to the cameras that saw it.
+        view_direction: (p, 3) float16, mean unit vector from the point to the cameras that saw it.
         view_spread_cos: (p,) float32, cosine of the angle between that mean and the outermost view.
         view_distance: (p,) float32, between the nearest and the farthest of those cameras, in the middle.
         descriptors: (p, 128) uint8, mean RootSIFT of the track, length 512.
@@ -41,10 +42,11 @@ class Segment:
             how many points images share, as scipy.sparse.csr_array has it.
     """
 
-    points: FloatArray
+    origin: FloatArray
+    points: NDArray[np.float32]
     point_row: NDArray[np.int32]
     covariance: NDArray[np.float32]
-    view_direction: NDArray[np.float32]
+    view_direction: NDArray[np.float16]
     view_spread_cos: NDArray[np.float32]
     view_distance: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
@@ -73,6 +75,7 @@ def segment_of(feature_map: FeatureMap) -> Segment:
     keep = np.flatnonzero(observations.has_descriptor)
     rows, see_point = np.unique(observations.point_index[keep], return_inverse=True)
     points = feature_map.points_local()[rows]
+    origin = np.median(points, axis=0, keepdims=True) if len(points) else np.zeros((1, 3))
     see_image = feature_map.image_rows(observations.image_id[keep])
     images = feature_map.images
     poses = [image.cam_from_local for image in images]
@@ -95,10 +98,11 @@ def segment_of(feature_map: FeatureMap) -> Segment:
     codes = DescriptorCodes.of(descriptors)
     shared = _shared(see_image, see_point, len(centers), len(rows))
     return Segment(
-        points=points,
+        origin=origin,
+        points=(points - origin).astype(np.float32),
         point_row=rows.astype(np.int32),
         covariance=feature_map.points.covariance[rows],
-        view_direction=cones.direction.astype(np.float32),
+        view_direction=cones.direction.astype(np.float16),
         view_spread_cos=cones.spread_cos.astype(np.float32),
         view_distance=(0.5 * (near + far)).astype(np.float32),
         descriptors=descriptors,

@@ -1,11 +1,13 @@
 """Segments as files in the user's cache: a map is laid out once for each of its states, not at each start.
 
 A file is an Arrow file with one row, whose columns are the arrays' bytes. It is mapped and not read: what
-nobody asks for takes no memory.
+nobody asks for takes no memory, and what only the index asked for gives it back (`SegmentFiles.settle`).
 """
 
+import ctypes
 import hashlib
 import logging
+import mmap
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -23,14 +25,15 @@ from featuredb.index.descriptor_index import CODE_BYTES, LISTS, trained_digest
 from featuredb.index.segment import Segment
 
 _LOG = logging.getLogger(__name__)
-_LAYOUT = "1"  # raised where the same arrays come to mean something else
+_LAYOUT = "2"  # raised where the same arrays come to mean something else
 _SUFFIX = ".arrow"
 # Of each array of a segment, the type and the shape of a row.
 _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "points": ("<f8", (3,)),
+    "origin": ("<f8", (3,)),
+    "points": ("<f4", (3,)),
     "point_row": ("<i4", ()),
     "covariance": ("<f4", (6,)),
-    "view_direction": ("<f4", (3,)),
+    "view_direction": ("<f2", (3,)),
     "view_spread_cos": ("<f4", ()),
     "view_distance": ("<f4", ()),
     "descriptors": ("|u1", (DESCRIPTOR_SIZE,)),
@@ -49,7 +52,7 @@ _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "shared_image": ("<i4", ()),
     "shared_count": ("<i4", ()),
 }
-_OF_POINTS = (*list(_ARRAYS)[1:7], "lists", "codes")
+_OF_POINTS = (*list(_ARRAYS)[2:8], "lists", "codes")
 _OF_IMAGES = ("image_camera", "image_pose", "image_covariance", "image_center", "image_scene", "image_reach")
 _MOST_BYTES = 20 * 2**30
 
@@ -70,6 +73,7 @@ class SegmentFiles:
         self._database, self._most_bytes = database, most_bytes
         self._folder = _default_folder() if folder is None else folder
         self._used: dict[Path, int] = {}
+        self._read: list[mmap.mmap] = []
         self._told = self._written = False
 
     def get(self, write_id: str, make: Callable[[], Segment]) -> Segment:
@@ -79,17 +83,32 @@ class SegmentFiles:
         key = f"{_layout()} {self._database} {write_id}"
         name = hashlib.sha256(key.encode()).hexdigest()
         path = self._folder / name[:2] / f"{name}{_SUFFIX}"
-        kept = _read(path)
+        kept = self._mapped(path)
         if kept is None:
-            kept = make()
-            self._keep(path, kept)
-        else:
-            with suppress(OSError):
-                os.utime(path)
-                self._used[path] = path.stat().st_size
+            made = make()
+            kept = self._mapped(path) if self._keep(path, made) else None
+            return made if kept is None else kept
+        with suppress(OSError):
+            os.utime(path)
+            self._used[path] = path.stat().st_size
         return kept
 
-    def _keep(self, path: Path, segment: Segment) -> None:
+    def _mapped(self, path: Path) -> Segment | None:
+        """The segment of a file; None where there is none that may be read, or it is broken."""
+        try:
+            with path.open("rb") as file:
+                content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            segment = _segment_of(content)
+        except (FileNotFoundError, PermissionError, NotADirectoryError):
+            return None
+        except (OSError, pa.ArrowException, ValueError, KeyError, TypeError, IndexError) as error:
+            _LOG.warning("%s is broken and made anew: %s", path, error)
+            return None
+        self._read.append(content)
+        return segment
+
+    def _keep(self, path: Path, segment: Segment) -> bool:
+        """Whether there is a file of it now."""
         size = sum(getattr(segment, name).nbytes for name in _ARRAYS)
         try:
             if sum(self._used.values()) + size > self._most_bytes:
@@ -98,6 +117,7 @@ class SegmentFiles:
                 _write(temporary, segment)
             self._used[path] = size
             self._written = True
+            return True
         except OSError as error:
             if not self._told:
                 _LOG.warning(
@@ -106,9 +126,22 @@ class SegmentFiles:
                     error,
                 )
             self._told = True
+            return False
 
-    def prune(self) -> None:
-        """Remove files until what is left fits; those used or written here stay."""
+    def settle(self) -> None:
+        """Once all is indexed: memory that only this took is given back; files go until what is left fits.
+
+        Files that were used or written here stay.
+        """
+        for content in self._read:
+            if hasattr(mmap, "MADV_DONTNEED"):
+                content.madvise(mmap.MADV_DONTNEED)
+        self._read.clear()
+        with suppress(OSError, AttributeError):  # of glibc: what is free between what is used
+            ctypes.CDLL(None).malloc_trim(0)
+        self._prune()
+
+    def _prune(self) -> None:
         if self._folder is None or not self._written:
             return
         found = []
@@ -150,18 +183,12 @@ def _write(path: Path, segment: Segment) -> None:
         writer.write_batch(pa.record_batch(columns, schema=schema))
 
 
-def _read(path: Path) -> Segment | None:
-    """The segment of a file; None where there is none that may be read, or it is broken."""
-    try:
-        with pa.ipc.open_file(pa.memory_map(str(path))) as reader:
-            batch = reader.get_batch(0)
-        segment = Segment(**{name: _array(batch.column(name), *kind) for name, kind in _ARRAYS.items()})
-        _check(segment)
-    except (FileNotFoundError, PermissionError, NotADirectoryError):
-        return None
-    except (OSError, pa.ArrowException, ValueError, KeyError, TypeError, IndexError) as error:
-        _LOG.warning("%s is broken and made anew: %s", path, error)
-        return None
+def _segment_of(content: mmap.mmap) -> Segment:
+    """Raises ValueError, KeyError, TypeError, IndexError, ArrowException: it is none."""
+    with pa.ipc.open_file(pa.BufferReader(pa.py_buffer(content))) as reader:
+        batch = reader.get_batch(0)
+    segment = Segment(**{name: _array(batch.column(name), *kind) for name, kind in _ARRAYS.items()})
+    _check(segment)
     return segment
 
 
@@ -178,6 +205,7 @@ def _check(segment: Segment) -> None:
     points, images = len(segment.points), len(segment.image_id)
     counts = dict.fromkeys(_OF_POINTS, points) | dict.fromkeys(_OF_IMAGES, images)
     counts |= {
+        "origin": 1,
         "image_start": images + 1,
         "shared_start": images + 1,
         "shared_count": len(segment.shared_image),

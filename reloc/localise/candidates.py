@@ -124,11 +124,11 @@ def find_clusters(
         return [Cluster(area=r.area, images=r.images, points=r.points, score=np.inf) for r in reach]
     small = [len(r.points) <= most for r in reach]
     votes = _vote(reach, features, options)
-    share = sum(float(v.sum()) for v in votes) / max(sum(len(r.points) for r in reach), 1)
+    share = sum(float(given.sum()) for _, given in votes) / max(sum(len(r.points) for r in reach), 1)
     found: list[Cluster] = []
     for i, r in enumerate(reach):
         if small[i]:
-            score = float(_above_chance(votes[i].sum(), share * len(r.points)))
+            score = float(_above_chance(votes[i][1].sum(), share * len(r.points)))
             found.append(Cluster(area=r.area, images=r.images, points=r.points, score=score))
         else:
             found.extend(_grow_clusters(r.area, _image_scores(r, votes[i], share), options))
@@ -179,8 +179,13 @@ def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOption
     return np.asarray(area.searched_images() & (np.minimum(to_camera, to_scene) <= margin), dtype=np.bool_)
 
 
-def _vote(reach: Sequence[_Reach], features: Features, options: CandidateOptions) -> list[FloatArray]:
-    """For each area the votes (p,) of all its points: a feature votes for its nearest point in reach.
+_Votes = tuple[NDArray[np.int64], FloatArray]
+
+
+def _vote(reach: Sequence[_Reach], features: Features, options: CandidateOptions) -> list[_Votes]:
+    """For each area the points (v,) that got votes, ascending, and how many (v,).
+
+    A feature votes for its nearest point in reach.
 
     By as much as that point is nearer than the `vote_background`-th, in squares: what looks like everything
     else says nothing (McCann and Lowe, Local Naive Bayes Nearest Neighbor, 2012). Points as near as the
@@ -194,12 +199,13 @@ def _vote(reach: Sequence[_Reach], features: Features, options: CandidateOptions
     weight = np.maximum(1.0 - squared / background, 0.0)
     weight[squared > (1.0 + options.vote_tie) ** 2 * ranked[:, :1]] = 0.0
     weight /= max(float(weight[weight > 0.0].mean()) if (weight > 0.0).any() else 0.0, 1e-9)
-    votes: list[FloatArray] = []
-    for i, r in enumerate(reach):
+    votes: list[_Votes] = []
+    for i in range(len(reach)):
         given = (weight > 0.0) & (part == i)
-        counted = np.zeros(len(r.area.points))
-        np.add.at(counted, rows[given], weight[given])
-        votes.append(counted)
+        voted, vote = np.unique(rows[given], return_inverse=True)
+        counted = np.zeros(len(voted))
+        np.add.at(counted, vote, weight[given])
+        votes.append((voted, counted))
     return votes
 
 
@@ -269,7 +275,7 @@ def _nearest_of(
     )
 
 
-def _image_scores(reach: _Reach, votes_of_point: FloatArray, share: float) -> FloatArray:
+def _image_scores(reach: _Reach, votes: _Votes, share: float) -> FloatArray:
     """(i,) votes of each of the area's images above what chance gives it, in standard deviations.
 
     Those out of reach have minus infinity.
@@ -280,8 +286,8 @@ def _image_scores(reach: _Reach, votes_of_point: FloatArray, share: float) -> Fl
     """
     area, images = reach.area, reach.images
     scores = np.full(len(area.image_map), -np.inf)
-    votes = area.sums_over_sights(votes_of_point)[images]
-    scores[images] = _above_chance(votes, share * area.image_sights[images])
+    of_image = area.sums_over_sights(*votes)[images]
+    scores[images] = _above_chance(of_image, share * area.image_sights[images])
     return scores
 
 

@@ -35,7 +35,7 @@ def test_points_views_and_reach_against_loops() -> None:
     seen = feature_map.observations
     point_row = area.point_row.whole()
     np.testing.assert_array_equal(point_row, np.unique(seen.point_index))
-    np.testing.assert_allclose(area.points.whole(), local[point_row], atol=1e-6)
+    np.testing.assert_allclose(area.points.whole(), local[point_row], atol=1e-5)
     centers = np.array([i.cam_from_local.center for i in feature_map.images])
     np.testing.assert_allclose(area.image_center, centers, atol=1e-9)
     directions = area.view_direction[np.arange(len(point_row))]
@@ -45,7 +45,7 @@ def test_points_views_and_reach_against_loops() -> None:
         distance = np.linalg.norm(toward, axis=1)
         mean = (toward / distance[:, None]).sum(axis=0)
         mean /= np.linalg.norm(mean)
-        np.testing.assert_allclose(directions[row], mean, atol=1e-6)
+        np.testing.assert_allclose(directions[row], mean, atol=5e-4)
         assert area.view_spread_cos.whole()[row] == pytest.approx((toward @ mean / distance).min(), abs=1e-6)
         assert area.view_distance.whole()[row] == pytest.approx(
             (distance.min() + distance.max()) / 2, abs=1e-5
@@ -108,7 +108,7 @@ def test_two_maps_of_two_frames_and_zones_lie_in_one_frame() -> None:
         area.points[np.flatnonzero(first)], points[area.point_row[np.flatnonzero(first)]], atol=2e-4
     )
     here_seen, there_seen = (area.view_direction[np.flatnonzero(part)] for part in (first, second))
-    np.testing.assert_allclose(here_seen, there_seen, atol=1e-5)
+    np.testing.assert_allclose(here_seen, there_seen, atol=1e-3)
     np.testing.assert_allclose(area.image_center[:4], area.image_center[4:], atol=1e-6)
     # Covariances turn with the axes: the east-north one of the far map is not that of this frame's axes.
     turn = away_from_here.rotation.T
@@ -134,7 +134,7 @@ def test_which_images_see_points_of_several_maps() -> None:
         sees = area.points_of_images(np.array([image]))
         assert {p for i, p in pairs if i == image} == set(np.flatnonzero(np.isin(rows, sees)).tolist())
     assert len(pairs) == len(images)
-    counted = area.sums_over_sights(np.isin(np.arange(len(area.points)), rows).astype(float))
+    counted = area.sums_over_sights(rows, np.ones(len(rows)))
     np.testing.assert_array_equal(counted, np.bincount(images, minlength=len(area.image_map)))
     assert [len(part) for part in area.images_that_see(rows[:0])] == [0, 0]
 

@@ -132,7 +132,7 @@ def test_the_folder_is_bounded_and_what_is_used_stays(tmp_path: Path) -> None:
     files = SegmentFiles("db", tmp_path, most_bytes=int(2.5 * size))
     files.get("w1", Made())
     files.get("w9", Made())
-    files.prune()
+    files.settle()
     for write_id, kept in (("w0", False), ("w1", True), ("w2", False), ("w3", False), ("w9", True)):
         made = Made()
         SegmentFiles("db", tmp_path).get(write_id, made)
@@ -151,7 +151,7 @@ def test_of_more_than_fits_the_same_part_is_kept_at_each_start(
         with caplog.at_level(logging.WARNING):
             for k in range(8):
                 files.get(f"w{k}", made[k])
-        files.prune()
+        files.settle()
         counts.append(sum(one.count for one in made))
     assert counts[0] == 8
     assert counts[1] == counts[2] <= 4
@@ -181,7 +181,7 @@ def test_without_a_home_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None
     made, files = Made(), SegmentFiles("db")
     for _ in range(2):
         assert_same(files.get("w1", made), made.segment)
-    files.prune()
+    files.settle()
     assert made.count == 2
 
 
