@@ -25,7 +25,10 @@ def register(subparsers: Any) -> None:
         "its drift and the drift budget (95 %), and why some are not active.",
     )
     parser.add_argument(
-        "map_id", metavar="MAP", nargs="?", help="only this map, its ancestors and its descendants"
+        "map_id",
+        metavar="MAP",
+        nargs="?",
+        help="only this map, by its id or first letters, its ancestors and its descendants",
     )
     parser.add_argument("--all", action="store_true", help="retired maps, too (with MAP they always show)")
     add_as_of_argument(parser)
@@ -35,7 +38,8 @@ def register(subparsers: Any) -> None:
 def run_lineage(args: argparse.Namespace) -> None:
     snapshot = open_database(args).snapshot(args.as_of)
     lineages = snapshot.lineages()
-    maps = _wanted(snapshot, args.map_id, include_retired=args.all)
+    named = None if args.map_id is None else snapshot.find(args.map_id, include_retired=True).map_id
+    maps = _wanted(snapshot, named, include_retired=args.all)
     if args.json:
         told = [
             {name: getattr(summary, name) for name in _OF_SUMMARY}
@@ -44,7 +48,7 @@ def run_lineage(args: argparse.Namespace) -> None:
         ]
         write_json({"snapshot": snapshot.version, "maps": told})
     else:
-        sys.stdout.writelines(f"{line}\n" for line in draw_tree(maps, lineages, args.map_id))
+        sys.stdout.writelines(f"{line}\n" for line in draw_tree(maps, lineages, named))
 
 
 def draw_tree(

@@ -114,7 +114,7 @@ class FeatureDatabase:
         """Place a map by control points, by a scan, or by the other maps; exactly one of these is named.
 
         Args:
-            map_id: of the map; for a scan its first letters are enough.
+            map_id: of the map, or its first letters.
             control_points: OpenDroneMap's gcp_list.txt, as `featuredb register`.
             photos: the map's photos, whose frames are registered to the scans, as `featuredb anchor`.
             scans: ids or their first letters; empty: all around the map.
@@ -141,7 +141,7 @@ class FeatureDatabase:
         if control_points is not None:
             placed = place_by_control(self.store, map_id, as_path(control_points))
             done = placed.committed is not None
-            return Aligned(map_id=map_id, placed=done, report=placed, text=placed.as_text())
+            return Aligned(map_id=placed.map_id, placed=done, report=placed, text=placed.as_text())
         if by_maps:
             map_id = self.store.snapshot().find(map_id).map_id
             grown = self.grow()
