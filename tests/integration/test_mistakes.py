@@ -25,6 +25,8 @@ from tests.conftest import REPOSITORY
 from tests.support import planar_map as field
 from tests.support.films import film
 
+_NO_CA = '{mode: "client", transport: {link: {tls: {root_ca_certificate: "gone/ca.pem"}}}}'
+
 # Command, and what its line has to say. {port} is one at which nobody listens.
 MISTAKES = {
     "a camera model that does not exist": (
@@ -82,6 +84,10 @@ MISTAKES = {
     "a configuration that is cut off": (
         "live film.mp4 --config cut.json5",
         r"--config: .* in cut.json5, found: at 1:7 expected array",
+    ),
+    "a certificate that is not there": (
+        "query photos/a.jpg --config tls.json5",
+        r"--config: tls.json5: transport/link/tls/root_ca_certificate: expected .* none at gone/ca.pem",
     ),
     "a gateway by an empty configuration": (
         "gateway --port 0 --config empty.json5",
@@ -153,7 +159,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "film.gif").write_bytes(b"GIF89a and so on")
     film(here, "mp4")
     (here / "overlay-a.png").write_text("no photo")
-    for name, text in (("pose.json", ""), ("empty.json5", ""), ("cut.json5", "{mode:")):
+    for name, text in (
+        ("pose.json", ""),
+        ("empty.json5", ""),
+        ("cut.json5", "{mode:"),
+        ("tls.json5", _NO_CA),
+    ):
         (here / name).write_text(text)
     for name in ("link.mp4", "link.csv"):
         (here / name).symlink_to("film.mp4")
