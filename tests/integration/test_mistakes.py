@@ -49,6 +49,18 @@ MISTAKES = {
         "lidar add new.db missing.laz",
         r"missing.laz: expected a LAS, LAZ or COPC file, found none; check the path",
     ),
+    "a folder in place of its scans": (
+        "lidar add new.db .",
+        r"\.: expected a LAS, LAZ or COPC file, found a folder; name those in it, such as scan\.las",
+    ),
+    "a folder without scans": (
+        "lidar add new.db texts",
+        r"texts: expected a LAS, LAZ or COPC file, found a folder; it has no \.las, \.laz or \.tif",
+    ),
+    "a scan that is cut off": (
+        "lidar add new.db cut/scan.laz --crs EPSG:32632",
+        r"cut/scan\.laz: expected a readable LAS, LAZ or COPC file, found one that is truncated or broken",
+    ),
     "a scan without a coordinate system": (
         "lidar add new.db scan.las",
         r"expected a coordinate system in the file, found none; state the coordinate system by --crs",
@@ -173,6 +185,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = np.array([456_800.0, 5_429_300.0, 100.0]) + np.random.default_rng(0).uniform(0, 50, (100, 3))
     scan.x, scan.y, scan.z = place.T
     scan.write(str(here / "scan.las"))
+    (here / "cut").mkdir()
+    scan.write(str(here / "cut" / "scan.laz"))
+    (here / "cut" / "scan.laz").write_bytes((here / "cut" / "scan.laz").read_bytes()[:-400])
     Database.create(here / "field.db").commit_map(field.planar_map())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("featuredb.store.durable.making.FORMAT_VERSION", 999)
