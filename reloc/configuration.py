@@ -9,17 +9,6 @@ import zenoh
 
 from featuredb.errors import InvalidValueError
 
-# What Zenoh reads when it connects; of a missing one it says no more than that nobody answers.
-_FILES = (
-    *(
-        f"transport/link/tls/{side}_{kind}"
-        for side in ("listen", "connect")
-        for kind in ("certificate", "private_key")
-    ),
-    "transport/link/tls/root_ca_certificate",
-    "transport/auth/usrpwd/dictionary_file",
-)
-
 
 def read_configuration(path: Path) -> zenoh.Config:
     """What `--config` names.
@@ -34,12 +23,12 @@ def read_configuration(path: Path) -> zenoh.Config:
             f"--config: expected a Zenoh configuration (.json5) in {path}, found: {first_sentence(error)}; "
             "`featuredb keys init DIR` makes those of a server and its clients"
         ) from error
-    for key in _FILES:
-        named = json.loads(config.get_json(key))
-        if named is not None and not os.access(named, os.R_OK):
+    for key, named in json.loads(config.get_json("transport/link/tls")).items():
+        # Zenoh reads them when it connects, and says only that nobody answers.
+        if key.endswith(("_certificate", "_private_key")) and named and not os.access(named, os.R_OK):
             raise InvalidValueError(
-                f"--config: {path}: {key}: expected a file that can be read, found none at {named}; correct "
-                "the path, which counts from the working folder"
+                f"--config: {path}: tls/{key}: expected a file that can be read, found none at {named}; "
+                "correct the path, which counts from the working folder"
             )
     return config
 

@@ -25,10 +25,7 @@ def register(subparsers: Any) -> None:
         "its drift and the drift budget (95 %), and why some are not active.",
     )
     parser.add_argument(
-        "map_id",
-        metavar="MAP",
-        nargs="?",
-        help="only this map, by its id or first letters, its ancestors and its descendants",
+        "map_id", metavar="MAP", nargs="?", help="only this map, its ancestors and its descendants"
     )
     parser.add_argument("--all", action="store_true", help="retired maps, too (with MAP they always show)")
     add_as_of_argument(parser)

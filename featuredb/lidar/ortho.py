@@ -172,19 +172,15 @@ def check_overlap(ortho: OrthoImage, utm: FloatArray, epsg: int) -> None:
     xy = raster_from_utm(ortho.wkt, epsg, utm[0])(utm[:, :2])
     a, b, c, d, e, f = ortho.pixel_from_xy
     pixels = np.array([(x, y) for x in (0, ortho.width) for y in (0, ortho.height)]) - [c, f]
-    corners = np.linalg.solve([[a, b], [d, e]], pixels.T).T
+    corners = np.linalg.solve([[a, b], [d, e]], pixels.T).T.round(5)
     low, high = xy.min(axis=0), xy.max(axis=0)
     slack = 0.1 * (high - low)  # a box's edges are bent in another system
     if ((corners.max(axis=0) < low - slack) | (corners.min(axis=0) > high + slack)).any():
-        shown, wanted = (
-            " and ".join(
-                f"{name} {box[:, k].min():.8g} to {box[:, k].max():.8g}" for k, name in enumerate("xy")
-            )
-            for box in (corners, xy)
-        )
         raise ScanError(
-            f"{ortho.path}: expected an image of the scan's place, {wanted} in the image's reference system, "
-            f"found one of {shown}; check the file, or state its system by --ortho-crs"
+            f"{ortho.path}: expected an image of the scan's place, in the image's reference system "
+            f"{low.round(5).tolist()} to {high.round(5).tolist()}, found one of "
+            f"{corners.min(axis=0).tolist()} to {corners.max(axis=0).tolist()}; check the file, or state its "
+            "system by --ortho-crs"
         )
 
 

@@ -371,12 +371,8 @@ class Database:
 
 
 def normal_url(url: str) -> str:
-    """An absolute path for local places, the URL without trailing slash for others.
-
-    Raises:
-        InvalidValueError: it has a NUL byte, at which Arrow would end the process.
-    """
-    if "\0" in url:
+    """An absolute path for local places, the URL without trailing slash for others."""
+    if "\0" in url:  # Arrow would end the process
         raise InvalidValueError(f"expected a folder or an address in an object store, found {url!r}")
     if url.startswith("file://"):
         url = url.removeprefix("file://")

@@ -165,7 +165,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
     """
     if not reason.strip():
         raise StoreError(f"retire {scan_id}: expected a reason, for those who will ask later")
-    find_scan(database, scan_id)
+    scan_id = find_scan(database, scan_id).scan_id
 
     def retired(rows: list[Row]) -> tuple[Change, list[str]]:
         if live_row(rows, scan_id, "scan_id") is None:

@@ -151,13 +151,7 @@ def as_path(path: Any) -> Path:
 
 
 def check_kind(name: str, value: Any, kind: type, what: str = "") -> None:
-    """
-    Args:
-        what: the kind for people; "" for the class's own name.
-
-    Raises:
-        InvalidValueError: the value is neither None nor of the kind.
-    """
+    """Raises InvalidValueError: the value is neither None nor of the kind, which people call `what`."""
     if value is not None and not isinstance(value, kind):
         what = what or f"{kind.__module__}.{kind.__qualname__}"
         raise InvalidValueError(f"{name}: expected {what}, found {value!r}")

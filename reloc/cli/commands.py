@@ -107,12 +107,7 @@ def add_request_arguments(parser: argparse.ArgumentParser) -> None:
         help="one standard deviation of each of --camera's parameters, OPENCV's or SIMPLE_RADIAL's; without "
         "it they are exact",
     )
-    parser.add_argument(
-        "--map",
-        action="append",
-        metavar="ID",
-        help="search only the map of this id, or of these first letters; may be repeated",
-    )
+    parser.add_argument("--map", action="append", metavar="ID", help="search only this map; may be repeated")
 
 
 def _add_query_arguments(parser: argparse.ArgumentParser) -> None:

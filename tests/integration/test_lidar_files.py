@@ -170,7 +170,7 @@ def test_an_image_of_another_place_is_refused_and_what_one_colours_is_told(
     write_geotiff(tmp_path / "empty.tif", 0 * grey, **place, nodata=0)
     dsm = [tmp_path / "dsm.tif"]
 
-    said = rf"away\.tif: expected an image of the scan's place, .*, found one of x {west:.8g} .*--ortho-crs"
+    said = rf"away\.tif: expected an image of the scan's place, .*, found one of \[{west:.2f}.*--ortho-crs"
     with pytest.raises(ScanError, match=said):
         add_scan(database, dsm, ortho=tmp_path / "away.tif")
     assert not Path(database.url).exists()

@@ -99,7 +99,7 @@ MISTAKES = {
     ),
     "a certificate that is not there": (
         "query photos/a.jpg --config tls.json5",
-        r"--config: tls.json5: transport/link/tls/root_ca_certificate: expected .* none at gone/ca.pem",
+        r"--config: tls.json5: tls/root_ca_certificate: expected a file .* none at gone/ca.pem",
     ),
     "a gateway by an empty configuration": (
         "gateway --port 0 --config empty.json5",
