@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from functools import partial
@@ -26,6 +26,7 @@ from featuredb.maps.lineage import MapLineage
 from featuredb.maps.move import placed_map
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database, MapSummary, Snapshot
+from featuredb.store.snapshot import full_id
 from featuredb.store.tables import BOUNDS
 from reloc.localise.candidates import IndexedArea, indexed_together
 from reloc.localise.localise import localise
@@ -192,21 +193,15 @@ class Localiser:
         return {**self.__dict__, "_states": {}}
 
     def areas_of(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
-        """All areas, or those of the named maps, of which only these are searched.
+        """All areas, or those of the maps named by id or first letters, of which only these are searched.
 
         Raises:
             MapNotFoundError: the snapshot serves no such map.
         """
         if map_ids is None:
             return list(self.areas)
-        wanted = set(map_ids)
+        wanted = set(self._full_ids(map_ids, self._placed_ids()))
         ids_of = [{m.map_id for m in indexed.area.maps} for indexed in self.areas]
-        unknown = wanted - self._provisional.keys() - set().union(*ids_of)
-        if unknown:
-            raise MapNotFoundError(
-                f"snapshot {self.snapshot} serves no map {', '.join(sorted(unknown))}; "
-                "`featuredb maps` lists what there is"
-            )
         chosen = [
             indexed if ids <= wanted else indexed.only(wanted)
             for indexed, ids in zip(self.areas, ids_of, strict=True)
@@ -216,21 +211,31 @@ class Localiser:
             self._provisional[map_id].get() for map_id in sorted(wanted & self._provisional.keys())
         ]
 
+    def _placed_ids(self) -> set[str]:
+        return {m.map_id for indexed in self.areas for m in indexed.area.maps} | self._provisional.keys()
+
+    def _full_ids(self, map_ids: Iterable[str], served: Collection[str]) -> list[str]:
+        """The ids that are meant, by themselves or by their first letters. Raises MapNotFoundError."""
+        none = f"snapshot {self.snapshot} serves no map %s; `featuredb maps` lists what there is"
+        return [full_id(start, served, "maps", MapNotFoundError, none % start) for start in map_ids]
+
     def own_area_of(self, map_ids: tuple[str, ...] | None) -> _OwnArea | None:
         """The map without a place that is named alone, and its area, whose local frame is the map's own.
 
         Whoever asks for it has to word every pose in the map's frame: the area's place means nothing.
 
         Raises:
+            MapNotFoundError: the snapshot serves no such map.
             UnplacedBesideOthersError: it is named beside others.
         """
-        named = [m for m in map_ids or () if m in self._unplaced]
+        ids = self._full_ids(map_ids or (), self._placed_ids() | self._unplaced.keys())
+        named = [m for m in ids if m in self._unplaced]
         if not named:
             return None
-        if len(set(map_ids or ())) > 1:
+        if len(set(ids)) > 1:
             raise UnplacedBesideOthersError(
                 f"map {named[0]} has no place: expected it to be named alone, since its answers are in a "
-                f"frame of its own, found {', '.join(map_ids or ())}"
+                f"frame of its own, found {', '.join(ids)}"
             )
         return self._unplaced[named[0]].get()
 

@@ -64,7 +64,7 @@ def register(subparsers: Any) -> None:
     retire = add_command(
         subparsers, "retire", run_retire, "take a map out of service, with its descendants, or a scan"
     )
-    retire.add_argument("map_id", metavar="MAP", help="id of a map or of a LiDAR scan")
+    retire.add_argument("map_id", metavar="MAP", help="id of a map or of a LiDAR scan, or its first letters")
     retire.add_argument("--reason", required=True, help="kept with the map or scan")
     rollback = add_command(subparsers, "rollback", run_rollback, "show again what an earlier version showed")
     rollback.add_argument("version", type=version_or_time, metavar="VERSION", help="number or ISO 8601 time")
@@ -180,14 +180,20 @@ def run_verify(args: argparse.Namespace) -> int:
 
 
 def run_retire(args: argparse.Namespace) -> None:
+    from featuredb.errors import MapNotFoundError
     from featuredb.store.scans import list_scans, retire_scan
+    from featuredb.store.snapshot import full_id
 
     database = open_database(args)
+    scans = {scan.scan_id for scan in list_scans(database, include_retired=True)}
+    ids = scans | {m.map_id for m in database.snapshot().any_maps(include_retired=True)}
+    none = f"no map or scan {args.map_id}; `featuredb maps` and `featuredb lidar list` list what there is"
+    meant = full_id(args.map_id, ids, "maps and scans", MapNotFoundError, none)
     retired: tuple[str, ...] = ()
-    if args.map_id not in {scan.scan_id for scan in list_scans(database, include_retired=True)}:
-        retired = database.retire(args.map_id, args.reason)
-    elif retire_scan(database, args.map_id, args.reason):
-        retired = (args.map_id,)
+    if meant not in scans:
+        retired = database.retire(meant, args.reason)
+    elif retire_scan(database, meant, args.reason):
+        retired = (meant,)
     sys.stdout.write(f"retired: {', '.join(retired) if retired else 'nothing, it was retired already'}\n")
 
 

@@ -116,10 +116,11 @@ def summary(scan: "ScanSummary", outcome: str) -> str:
     if scan.has_intensity:
         intensity = f"raw {row['intensity_low']:g} to {row['intensity_high']:g} stretched to 0 to 255"
     lines = [("files", f"{len(row['files'])} with {scan.points_in_files:,} points")]
+    of_first = f", from {row['crs_source']}, in {row['horizontal_unit']}"
     for crs, transformation, accuracy in dict.fromkeys(
         (f["crs"], f["transformation"], f["transformation_accuracy_m"]) for f in row["files"]
     ):
-        lines.append(("CRS", f"{crs}, from {row['crs_source']}, in {row['horizontal_unit']}"))
+        lines.append(("CRS", crs + (of_first if crs == row["files"][0]["crs"] else "")))
         stated = "accuracy not stated" if accuracy is None else f"accuracy {accuracy:g} m"
         lines.append(("stored in", f"EPSG:{scan.epsg}, by: {transformation} ({stated})"))
     unit = f"{row['height_unit']} of {row['height_unit_m']:.12g} m"

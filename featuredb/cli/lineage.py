@@ -35,7 +35,8 @@ def register(subparsers: Any) -> None:
 def run_lineage(args: argparse.Namespace) -> None:
     snapshot = open_database(args).snapshot(args.as_of)
     lineages = snapshot.lineages()
-    maps = _wanted(snapshot, args.map_id, include_retired=args.all)
+    named = None if args.map_id is None else snapshot.find(args.map_id, include_retired=True).map_id
+    maps = _wanted(snapshot, named, include_retired=args.all)
     if args.json:
         told = [
             {name: getattr(summary, name) for name in _OF_SUMMARY}
@@ -44,7 +45,7 @@ def run_lineage(args: argparse.Namespace) -> None:
         ]
         write_json({"snapshot": snapshot.version, "maps": told})
     else:
-        sys.stdout.writelines(f"{line}\n" for line in draw_tree(maps, lineages, args.map_id))
+        sys.stdout.writelines(f"{line}\n" for line in draw_tree(maps, lineages, named))
 
 
 def draw_tree(

@@ -83,7 +83,7 @@ def selected_any(
     """
     there = snapshot.any_maps(include_retired=True)
     if selection.maps:
-        wanted = {snapshot.get_any(map_id).map_id for map_id in selection.maps}
+        wanted = {snapshot.find(start, include_retired=True).map_id for start in selection.maps}
         found = [m for m in there if m.map_id in wanted]
     else:
         found = [m for m in there if m.status in selection.statuses]

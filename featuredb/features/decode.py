@@ -127,8 +127,9 @@ def _read_file(path: Path, limits: DecodeLimits) -> bytes:
             raise _too_many_bytes(info.st_size, limits)
         with path.open("rb") as file:
             return file.read(limits.max_bytes + 1)
-    except OSError as error:
-        raise ImageError(f"{path.name} cannot be read: {error.strerror or error}", "unreadable") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
+        why = getattr(error, "strerror", None) or error
+        raise ImageError(f"{path.name} cannot be read: {why}", "unreadable") from error
 
 
 def _too_many_bytes(size: int, limits: DecodeLimits) -> ImageError:

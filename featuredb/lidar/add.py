@@ -12,19 +12,21 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from featuredb.atomic import atomic_file, file_sha256, user_cache
 from featuredb.errors import ConflictError, GeodesyError, ScanError
 from featuredb.geo.crs.scan import ScanCrs, scan_crs
 from featuredb.geo.crs.utm_transform import UtmTransform, utm_transform
+from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.clean import OutlierOptions, clean_block, finest_level
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.formats.ortho_image import OrthoImage, is_raster, open_dsm, open_ortho, read_dsm
-from featuredb.lidar.ortho import LAID
+from featuredb.lidar.ortho import LAID, check_overlap
 from featuredb.lidar.spill import BlockPlan, Spill, Staged, stretch_of
 from featuredb.store import Database
 from featuredb.store.encode import Row
@@ -38,6 +40,8 @@ _LARGEST_8_BIT = 255
 _BYTES_PER_POINT = 100
 _OF_CRS = ("horizontal_unit", "height_datum", "height_unit", "height_unit_m", "height_unit_reason")
 _PLAN = "spill.json"  # in a work folder: the first pass is done
+# Of Earth's surface, from Challenger Deep to Everest with its ellipsoidal heights.
+_DEEPEST_M, _HIGHEST_M = -11_000.0, 9_000.0
 _FORMAT = 1  # of scans: raised when the same files and options give other rows
 
 
@@ -149,6 +153,11 @@ class ScanInput:
     crs: ScanCrs
     to_utm: UtmTransform
 
+    def corners(self) -> FloatArray:
+        """UTM coordinates (8, 3) of the corners of the file's box, metres."""
+        axes = np.stack([self.file.low, self.file.high], axis=1)
+        return self.to_utm.apply(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3))
+
 
 OnProgress = Callable[[str, int, int], None]
 """Told the step ("read", "clean", "write"), and how many points of how many are done in it."""
@@ -182,7 +191,7 @@ def add_scan(
     Raises:
         ScanFileError: a file is not LAS, empty, truncated or broken; nothing is left behind.
         GeodesyError: a CRS is missing, broken or wrong.
-        ScanError: the files do not fit each other, or nothing is left of them.
+        ScanError: the files do not fit each other, nothing is left of them, or the image lies elsewhere.
         StoreError: the database cannot be written.
         MissingExtraError: the packages of the extra `lidar` are not installed.
     """
@@ -195,13 +204,17 @@ def add_scan(
         if scan.scan_id == scan_id:
             return AddResult(created=False, scan=scan)
     inputs = _place_all(opened, options)
+    if image is not None:
+        check_overlap(image, np.concatenate([item.corners() for item in inputs]), inputs[0].to_utm.epsg)
     with work_folder(database, work, f"lidar-{scan_id}", sum(f.points for f in opened)) as folder:
         plan = _read_all(folder, inputs, options, on_progress)
         staged = _clean_all(folder, plan, options, image, inputs[0].to_utm.epsg, on_progress)
         row = _row(scan_id, inputs, plan, staged, options)
         row |= {"name": name or inputs[0].file.path.name, "source": source, "licence": licence}
-        if look:
-            row |= {"colour": "ortho", "ortho": json.dumps(look)}
+        if image is not None:
+            shown = staged.shown()
+            row |= {"colour": "ortho" if shown else row["colour"], "ortho": json.dumps(look)}
+            row["notes"].append(f"the ortho image colours {shown / row['points']:.1%} of the points")
         Database.create(database.url, storage_options=database.storage_options)
         created, _ = commit_scan(
             database,
@@ -241,16 +254,29 @@ def _place_all(files: Sequence[ScanFile], options: AddOptions) -> list[ScanInput
                 height_datum=options.height_datum,
             )
             to_utm = utm_transform(crs, file.low, file.high, epsg)
+            inputs.append(ScanInput(file=file, crs=crs, to_utm=to_utm))
+            _check_heights(inputs[-1])
         except GeodesyError as error:
             raise GeodesyError(f"{file.path}: {error}") from error
         epsg = to_utm.epsg
-        inputs.append(ScanInput(file=file, crs=crs, to_utm=to_utm))
         if crs.height_datum != inputs[0].crs.height_datum:
             raise ScanError(
                 f"expected files with heights of one datum, found {inputs[0].crs.height_datum} in "
                 f"{inputs[0].file.path} and {crs.height_datum} in {file.path}; add them as two scans"
             )
     return inputs
+
+
+def _check_heights(item: ScanInput) -> None:
+    """Refuse heights of which none is one of Earth's surface; single ones may be noise."""
+    heights = item.corners()[:, 2]
+    low, high = float(heights.min()), float(heights.max())
+    if low > _HIGHEST_M or high < _DEEPEST_M:
+        raise GeodesyError(
+            f"expected heights between {_DEEPEST_M:.0f} and {_HIGHEST_M:.0f} m, found {low:.0f} to "
+            f"{high:.0f} m by the unit {item.crs.height_unit} ({item.crs.height_unit_reason}); state "
+            "theirs by --height-unit, that of a raster in centimetres e.g. by gdal_edit.py -scale 0.01"
+        )
 
 
 def _read_all(
@@ -310,6 +336,10 @@ def _clean_all(
     return staged
 
 
+def _units(crs: ScanCrs) -> str:
+    return f"X, Y in {crs.horizontal_unit}, Z in {crs.height_unit} ({crs.height_unit_reason})"
+
+
 def _row(
     scan_id: str,
     inputs: Sequence[ScanInput],
@@ -320,6 +350,11 @@ def _row(
     """The scan's row in `lidar`, but for what people say about it."""
     crs = inputs[0].crs
     notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
+    units = {item.file.path.name: _units(item.crs) for item in inputs}
+    if len(set(units.values())) > 1:
+        crs = replace(crs, height_unit_reason=f"{crs.height_unit_reason}, in the first file, see the note")
+        told = "; ".join(f"{name} has {unit}" for name, unit in units.items())
+        notes.append(f"files of several units, all stored in metres: {told}")
     return {
         "scan_id": scan_id,
         "files": [

@@ -129,8 +129,8 @@ def clean_block(
     outliers: OutlierOptions | None,
     ortho: OrthoImage | None,
     epsg: int,
-) -> tuple[NDArray[Any], int]:
-    """The rows of a block as they go into the store, and how many outliers were dropped.
+) -> tuple[NDArray[Any], int, int]:
+    """The rows of a block as they go into the store, and how many outliers were dropped and points coloured.
 
     Args:
         ortho: colours the points. epsg: zone of the points.
@@ -141,15 +141,16 @@ def clean_block(
     colour_m = 0.0 if ortho is None else margin_m(plan.spacing_m)
     rows, core, dropped = _without_outliers(spill, plan, block, outliers, colour_m)
     rgb, has_rgb = _colours(rows, plan.colour_bits)
+    shown = 0
     if ortho is not None:
         # Where the image does not show a point, it keeps its colour, if it has one. With one spacing for all
         # blocks, none hides more.
         rgb, seen = colour_by_ortho(rows["utm"], epsg, rgb, ortho, plan.spacing_m)
-        has_rgb = has_rgb | seen
+        has_rgb, shown = has_rgb | seen, int(seen[:core].sum())
     rows, rgb, has_rgb = rows[:core], rgb[:core], has_rgb[:core]
     cleaned = np.zeros(core, POINT_ROW)
     if not core:
-        return cleaned, dropped
+        return cleaned, dropped, shown
     order = order_by_level(rows["utm"], plan.finest_level)
     rows = rows[order.order]
     cleaned["utm"] = rows["utm"]
@@ -160,7 +161,7 @@ def clean_block(
     cleaned["level"] = order.level
     cleaned["node"] = order.node
     cleaned["node_spacing_m"] = order.spacing_m
-    return cleaned, dropped
+    return cleaned, dropped, shown
 
 
 def _without_outliers(

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
+from featuredb.errors import InvalidValueError, ScanError
 from featuredb.geo.crs.utm_transform import raster_from_utm
 from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.formats.ortho_image import OrthoImage, sample_ortho
@@ -157,6 +157,31 @@ def colour_by_ortho(
     rgb[rows[valid]] = found[valid]
     coloured[rows[valid]] = True
     return rgb, coloured
+
+
+def check_overlap(ortho: OrthoImage, utm: FloatArray, epsg: int) -> None:
+    """Refuse an image of another place, by boxes; what they leave open, colouring tells.
+
+    Args:
+        utm: (n, 3) corners of the boxes of the scan's files, metres. epsg: their zone.
+
+    Raises:
+        ScanError: the image lies elsewhere.
+        GeodesyError: its reference system cannot be used.
+    """
+    xy = raster_from_utm(ortho.wkt, epsg, utm[0])(utm[:, :2])
+    a, b, c, d, e, f = ortho.pixel_from_xy
+    pixels = np.array([(x, y) for x in (0, ortho.width) for y in (0, ortho.height)]) - [c, f]
+    corners = np.linalg.solve([[a, b], [d, e]], pixels.T).T.round(5)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    slack = 0.1 * (high - low)  # a box's edges are bent in another system
+    if ((corners.max(axis=0) < low - slack) | (corners.min(axis=0) > high + slack)).any():
+        raise ScanError(
+            f"{ortho.path}: expected an image of the scan's place, in the image's reference system "
+            f"{low.round(5).tolist()} to {high.round(5).tolist()}, found one of "
+            f"{corners.min(axis=0).tolist()} to {corners.max(axis=0).tolist()}; check the file, or state its "
+            "system by --ortho-crs"
+        )
 
 
 @lru_cache(maxsize=4)

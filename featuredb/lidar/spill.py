@@ -307,12 +307,12 @@ class Staged:
         """Whether a block is finished."""
         return self._path(block, "json").is_file()
 
-    def put(self, block: TileBlock, rows: NDArray[Any], outliers: int) -> None:
+    def put(self, block: TileBlock, rows: NDArray[Any], outliers: int, shown: int) -> None:
         """Keep a finished block.
 
         Args:
             rows: (n,) POINT_ROW, by level and node.
-            outliers: how many were dropped.
+            outliers: how many were dropped. shown: how many have their colour from an ortho image.
         """
         with atomic_file(self._path(block, "npy")) as temporary, temporary.open("wb") as file:
             np.save(file, rows)
@@ -321,6 +321,7 @@ class Staged:
         facts = {
             "points": len(rows),
             "outliers": outliers,
+            "shown": shown,
             "levels": np.bincount(rows["level"], minlength=self._plan.finest_level + 1).tolist(),
             "classes": dict(zip(classes.tolist(), counts.tolist(), strict=True)),
             "low": utm.min(axis=0).tolist() if len(utm) else None,
@@ -328,6 +329,10 @@ class Staged:
         }
         with atomic_file(self._path(block, "json")) as temporary:
             temporary.write_text(json.dumps(facts))
+
+    def shown(self) -> int:
+        """How many points of all blocks have their colour from an ortho image."""
+        return sum(json.loads(self._path(block, "json").read_text())["shown"] for block in self._plan.blocks)
 
     def totals(self) -> Row:
         """What all blocks hold together, by columns of the table `lidar`: counts, and their box in UTM.

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from time import monotonic
 
-from featuredb.errors import ConflictError, StoreError
+from featuredb.errors import ConflictError, InvalidValueError, StoreError
 from featuredb.maps.feature_map import MapStatus
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store.changes import (
@@ -372,6 +372,8 @@ class Database:
 
 def normal_url(url: str) -> str:
     """An absolute path for local places, the URL without trailing slash for others."""
+    if "\0" in url:  # Arrow would end the process
+        raise InvalidValueError(f"expected a folder or an address in an object store, found {url!r}")
     if url.startswith("file://"):
         url = url.removeprefix("file://")
     if "://" in url:

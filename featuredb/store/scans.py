@@ -29,7 +29,7 @@ from featuredb.store.durable.filesystem import read_errors
 from featuredb.store.durable.log import list_entries
 from featuredb.store.encode import Row, table_of
 from featuredb.store.retry import retry_stale
-from featuredb.store.snapshot import UtmBox
+from featuredb.store.snapshot import UtmBox, full_id
 from featuredb.store.tables import LIDAR, LIDAR_POINTS, SPECS, UTM_COORDINATES
 
 # One row of `lidar_points` in memory, without the columns that are the same for a whole tile.
@@ -94,15 +94,14 @@ def list_scans(database: Database, *, include_retired: bool = False) -> list[Sca
 
 
 def find_scan(database: Database, scan_id: str) -> ScanSummary:
-    """One scan by its id, retired or not.
+    """One scan, retired or not, by its id or its first letters.
 
     Raises:
-        ScanNotFoundError: no such scan.
+        ScanNotFoundError: no such scan, or several ids begin so.
     """
-    for row in scan_rows(database):
-        if row["scan_id"] == scan_id:
-            return _summary(row)
-    raise ScanNotFoundError(f"no scan {scan_id}; `featuredb lidar list` lists what there is")
+    rows = {row["scan_id"]: row for row in scan_rows(database)}
+    none = f"no scan {scan_id}; `featuredb lidar list` lists what there is"
+    return _summary(rows[full_id(scan_id, rows, "scans", ScanNotFoundError, none)])
 
 
 def commit_scan(
@@ -166,7 +165,7 @@ def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
     """
     if not reason.strip():
         raise StoreError(f"retire {scan_id}: expected a reason, for those who will ask later")
-    find_scan(database, scan_id)
+    scan_id = find_scan(database, scan_id).scan_id
 
     def retired(rows: list[Row]) -> tuple[Change, list[str]]:
         if live_row(rows, scan_id, "scan_id") is None:

@@ -197,15 +197,16 @@ class Snapshot:
         row = self._row(map_id)
         return _summary(row) if has_place(row) else _unplaced_summary(row)
 
-    def find(self, start: str) -> MapSummary | UnplacedSummary:
-        """The map, not retired, of this id, or the only one whose id begins so.
+    def find(self, start: str, *, include_retired: bool = False) -> MapSummary | UnplacedSummary:
+        """The map of this id, or the only one whose id begins so.
 
         Raises:
             MapNotFoundError: there is none, or several begin so.
         """
-        live = [map_id for map_id, row in self._rows.items() if row["status"] != RETIRED]
-        none = f"snapshot {self.version} has no live map {start}; `featuredb maps` lists what there is"
-        return self.get_any(full_id(start, live, "maps", MapNotFoundError, none))
+        ids = [row["map_id"] for row in self._oldest_first(include_retired)]
+        kind = "map" if include_retired else "live map"
+        none = f"snapshot {self.version} has no {kind} {start}; `featuredb maps` lists what there is"
+        return self.get_any(full_id(start, ids, "maps", MapNotFoundError, none))
 
     def lineages(self) -> dict[str, MapLineage]:
         """What each map of the snapshot stands on, retired ones included, by id."""

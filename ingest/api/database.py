@@ -15,7 +15,7 @@ from featuredb.store.durable.making import check_place
 from featuredb.store.sql import SqlSession, SqlTable
 from ingest.anchoring import AnchorRequest, anchor
 from ingest.api.anchor_words import anchoring_text
-from ingest.api.ingesting import IngestChoices, as_path, ingest, ingest_options, several
+from ingest.api.ingesting import IngestChoices, as_path, check_kind, ingest, ingest_options, several
 from ingest.api.progress_bars import progress_bars
 from ingest.api.registering import place_by_control
 from ingest.api.results import Aligned, FilmTrack, Grown, Ingested, ListedMaps
@@ -114,7 +114,7 @@ class FeatureDatabase:
         """Place a map by control points, by a scan, or by the other maps; exactly one of these is named.
 
         Args:
-            map_id: of the map; for a scan its first letters are enough.
+            map_id: of the map, or its first letters.
             control_points: OpenDroneMap's gcp_list.txt, as `featuredb register`.
             photos: the map's photos, whose frames are registered to the scans, as `featuredb anchor`.
             scans: ids or their first letters; empty: all around the map.
@@ -131,6 +131,7 @@ class FeatureDatabase:
             InvalidValueError: none or several ways. RegistrationError: photos or scans are missing.
             ControlFileError, MapNotFoundError, StoreError, ConflictError
         """
+        check_kind("align: map_id", map_id, str, "the id of a map")
         asked = {"control_points": control_points, "photos": photos, "by_maps": by_maps or None}
         ways = [name for name, value in asked.items() if value is not None]
         if len(ways) != 1:
@@ -141,7 +142,7 @@ class FeatureDatabase:
         if control_points is not None:
             placed = place_by_control(self.store, map_id, as_path(control_points))
             done = placed.committed is not None
-            return Aligned(map_id=map_id, placed=done, report=placed, text=placed.as_text())
+            return Aligned(map_id=placed.map_id, placed=done, report=placed, text=placed.as_text())
         if by_maps:
             map_id = self.store.snapshot().find(map_id).map_id
             grown = self.grow()
@@ -159,7 +160,7 @@ class FeatureDatabase:
                 pose=_path(pose),
                 picks=_path(picks),
                 image=image,
-                near=None if near is None else Circle.parse(",".join(map(str, near))),
+                near=None if near is None else Circle.parse(",".join(map(str, several(near)))),
             ),
         )
         with progress_bars(quiet) as progress:
@@ -230,6 +231,9 @@ class FeatureDatabase:
             VideoError: no film. InvalidValueError: what was asked contradicts itself.
             StoreError, RegistrationError, ScanNotFoundError
         """
+        check_kind("track: prior", prior, GeoPrior)
+        check_kind("track: camera", camera, Camera)
+        check_kind("track: options", options, TrackVideoOptions)
         ground = FilmGround(
             by=by,
             maps=None if maps is None else several(maps),
@@ -277,6 +281,7 @@ class FeatureDatabase:
         Raises:
             ExportError: an unknown format, or `out` is there already. MissingExtraError
         """
+        check_kind("export: selection", selection, Selection)
         return export_maps(self.store, as_path(out), format, selection or Selection(), as_of=as_of, **options)
 
     def grow(self, options: GrowingOptions | None = None, *, quiet: bool = False) -> Grown:
@@ -285,6 +290,7 @@ class FeatureDatabase:
         Raises:
             StoreError, ConflictError, IngestError
         """
+        check_kind("grow: options", options, GrowingOptions)
         with progress_bars(quiet) as progress:
             return Grown(report=grow_candidates(self.store, options, progress))
 

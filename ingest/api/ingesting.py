@@ -1,8 +1,10 @@
 """What a person says of an ingest, and the ingest of photos that follows from it."""
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack
 
@@ -101,6 +103,14 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
     of_points = [name for name in ("gcp_crs", "gcp_sigma", "ground_height") if asked.get(name) is not None]
     if of_points and asked.get("gcp") is None:
         raise InvalidValueError(f"ingest: {', '.join(of_points)}: expected gcp beside it, control points")
+    for name in ("max_features", "max_side", "min_track_length", "workers"):
+        check_kind(f"ingest: {name}", asked.get(name), Integral, "a whole number")
+    for name in ("gps_sigma", "gcp_sigma", "ground_height"):
+        pair = (0, 0) if asked.get(name) is None else several(asked[name])
+        if len(pair) != 2 or not all(isinstance(value, Real) for value in pair):
+            raise InvalidValueError(f"ingest: {name}: expected two numbers in metres, found {asked[name]!r}")
+    for glob in several(asked.get("exclude") or ()):
+        check_kind("ingest: exclude", glob, str, "globs such as *_small.JPG")
     if asked.get("work") is not None:
         asked["work"] = as_path(asked["work"])
 
@@ -135,10 +145,16 @@ def as_path(path: Any) -> Path:
     Raises:
         InvalidValueError: no path.
     """
-    try:
-        return Path(path)
-    except TypeError as error:
-        raise InvalidValueError(f"expected a path, found {path!r}") from error
+    if not isinstance(path, str | os.PathLike) or "\0" in str(path):
+        raise InvalidValueError(f"expected a path, found {path!r}")
+    return Path(path)
+
+
+def check_kind(name: str, value: Any, kind: type, what: str = "") -> None:
+    """Raises InvalidValueError: the value is neither None nor of the kind, which people call `what`."""
+    if value is not None and not isinstance(value, kind):
+        what = what or f"{kind.__module__}.{kind.__qualname__}"
+        raise InvalidValueError(f"{name}: expected {what}, found {value!r}")
 
 
 def several(given: Any) -> tuple[Any, ...]:

@@ -57,6 +57,7 @@ def place_by_control(
     """Place a map, one without a place, too, and commit it unless it is refused.
 
     Args:
+        map_id: or its first letters, if no other map begins so.
         gcp: control points, OpenDroneMap's gcp_list.txt. crs: instead of the file's first line.
         height_datum: of the surveyed heights, where their reference system does not say it.
         report: folder for control.html and .json.
@@ -66,6 +67,8 @@ def place_by_control(
     """
     survey = Survey(file=read_control_file(gcp, crs), options=options or GcpOptions())
     snapshot = database.snapshot()
+    summary = snapshot.find(map_id)
+    map_id = summary.map_id
     before = snapshot.load_any(map_id)
     if isinstance(before, UnplacedMap):
         result = place_unplaced_by_gcp(before, survey, height_datum)
@@ -75,8 +78,7 @@ def place_by_control(
         write_control_report(report, f"Control points of {before.name}", result.placement)
     committed = None
     if result.feature_map is not None and not dry_run:
-        based_on = snapshot.get_any(map_id).write_id
-        committed = database.commit_map(result.feature_map, replaces=map_id, based_on=based_on)
+        committed = database.commit_map(result.feature_map, replaces=map_id, based_on=summary.write_id)
     return ControlledMap(map_id=map_id, result=result, committed=committed)
 
 

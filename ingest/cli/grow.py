@@ -57,7 +57,7 @@ def _register_promote(subparsers: Any) -> None:
         description="Promote a map without confirmation. Canaries are run first; if one "
         "regresses, the promotion is refused unless --force is given. `featuredb retire` undoes it.",
     )
-    promote.add_argument("map_id", metavar="MAP")
+    promote.add_argument("map_id", metavar="MAP", help="id of the map; its first letters are enough")
     promote.add_argument("--reason", required=True, help="kept with the map")
     promote.add_argument("--force", action="store_true", help="even if canaries regress")
 

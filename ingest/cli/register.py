@@ -18,7 +18,7 @@ def register(subparsers: Any) -> None:
         "adjustment with the points as control, residuals, wrong marks named. The new placement is a new "
         "commit; `featuredb rollback` and --as-of reach the map as it was.",
     )
-    parser.add_argument("map_id", metavar="MAP", help="id of the map, see `featuredb maps`")
+    parser.add_argument("map_id", metavar="MAP", help="id of the map; its first letters are enough")
     parser.add_argument(
         "--gcp", type=Path, required=True, metavar="FILE", help="control points, OpenDroneMap's gcp_list.txt"
     )

@@ -14,11 +14,14 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+import numpy as np
+
 from featuredb.errors import ImageError, IngestError
 from featuredb.features.decode import INGEST_LIMITS, DecodeLimits, decode_gray, probe, read_image_bytes
 from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.features.exif.read import read_exif
 from featuredb.features.image_header import check_signature
+from featuredb.geo.projections import ecef_from_geodetic
 from featuredb.maps.feature_map import GeoPrior, prior_from_exif
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
@@ -37,6 +40,7 @@ _REASONS = 3  # of skipped files that a refusal tells in full
 # Standard deviation of a table's position that does not say its own. Geotags of photo sites are tens of
 # metres off, where they are not wrong altogether.
 _GEOTAG_SIGMA_M = 30.0
+_FAR_M = 1000.0  # no receiver is that far off: table and photo speak of two places
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,7 +137,7 @@ def scan_table(
         )
         for number, reason in table.bad
     ]
-    return replace(result, photos=(*result.photos, *bad), notes=tuple(summary_of(table)))
+    return replace(result, photos=(*result.photos, *bad), notes=(*summary_of(table), *result.notes))
 
 
 def _table_file(row: TableRow) -> FoundFile:
@@ -159,9 +163,29 @@ def _scan_files(
     known = read_cache(cache_file, key) if cache_file else {}
     examined, read = _examine_all(files, known, options, progress, cache_file, key)
     photos = [_as_photo(file, examined.get(file.name), options) for file in files]
+    notes = _far_from_exif(photos, rows)
     photos = [_with_row(p, rows[p.name], options) if p.name in rows else p for p in photos]
     photos = _without_copies(photos, {name: e.picture_hash for name, e in examined.items()})
-    return ScanResult(photos=tuple(photos), read=read)
+    return ScanResult(photos=tuple(photos), read=read, notes=notes)
+
+
+def _far_from_exif(photos: Sequence[Photo], rows: Mapping[str, TableRow]) -> tuple[str, ...]:
+    """A line on a table that puts photos far from where they say themselves: it may be of other photos."""
+    apart_m: dict[str, float] = {}
+    for photo in photos:
+        row, own = rows.get(photo.name), photo.gps
+        if own is None or row is None or row.latitude_deg is None or row.longitude_deg is None:
+            continue
+        two = [(own.latitude_deg, own.longitude_deg, 0.0), (row.latitude_deg, row.longitude_deg, 0.0)]
+        apart_m[photo.name] = float(np.linalg.norm(np.diff(ecef_from_geodetic(np.array(two)), axis=0)))
+    far = [name for name, metres in apart_m.items() if metres > _FAR_M]
+    if not far:
+        return ()
+    return (
+        f"table: {len(far)} of {len(apart_m)} photos lie more than {_FAR_M / 1e3:.0f} km from the positions "
+        f"in their EXIF, {far[0]} by {apart_m[far[0]] / 1e3:.1f} km; the table's are used: check that it is "
+        "of these photos",
+    )
 
 
 def _excluded(file: FoundFile, patterns: Sequence[str]) -> FoundFile:

@@ -62,6 +62,10 @@ def _run(args: argparse.Namespace) -> int:
 
     if args.static is None:
         require("http", "The viewer (but not `--static OUT.html`)", "fastapi", "uvicorn")
+        from reloc.listening import listen
+        from reloc.viewer.server import HOST
+
+        listen(HOST, args.port).close()  # building the scene takes long, and the port may be taken
     elif args.static.exists():
         raise ExportError(f"{args.static}: expected a name that is free; nothing is overwritten")
     tracks = [read_trajectory_csv(path) for path in args.trajectory]

@@ -103,7 +103,7 @@ class Server:
     def start(
         cls, source: DatabaseSource, options: ServeOptions, database: str, inbox: Inbox | None = None
     ) -> Self:
-        """Load the area, then listen; when this returns, queries are answered.
+        """Listen, then load the area; when this returns, queries are answered.
 
         Without an inbox, which the server starts and closes, it takes no contributed photos.
 
@@ -116,12 +116,17 @@ class Server:
         )
         if not options.insecure:
             check_exposure(config)
-        prepare_workers()
-        area = source.load()
         endpoints = tuple(bind_free_port(endpoint) for endpoint in options.listen)
         if endpoints:
             config.insert_json5("listen/endpoints", json.dumps(endpoints))
+        # Before the area, which takes long. Until the server has a token, clients wait for it.
         session = open_server_session(config, ", ".join(endpoints) or str(options.config_path))
+        try:
+            prepare_workers()
+            area = source.load()
+        except BaseException:
+            session.close()
+            raise
         proven = authenticates(config)
         server = cls(source, options, database, inbox, area, session, endpoints, authenticates=proven)
         try:

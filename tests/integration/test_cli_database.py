@@ -16,8 +16,10 @@ import pytest
 
 from featuredb.cli.main import COMMAND_GROUP, build_parser, main, needed_for
 from featuredb.errors import StoreError
+from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from tests.support.command_line import only_command
+from tests.support.las_files import grid_points, write_scan
 from tests.support.maps import random_map
 
 DATABASE_COMMANDS = EntryPoint("db", "featuredb.cli.database:register", COMMAND_GROUP)
@@ -72,6 +74,23 @@ def test_retire_and_rollback(db: str, capsys: pytest.CaptureFixture[str]) -> Non
     assert len(run(capsys, "maps", db, "--all")[1].splitlines()) == 6
     assert run(capsys, "rollback", db, "1")[:2] == (0, "version 3\n")
     assert len(run(capsys, "maps", db)[1].splitlines()) == 6
+
+
+def test_first_letters_of_a_map_or_scan_are_enough(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = str(tmp_path / "maps.db")
+    maps = [random_map(i, map_id=name) for i, name in enumerate(("abc", "abd", "b"))]
+    database = Database.create(url)
+    database.commit_maps([maps[0], replace(maps[1], parents=("abc",)), maps[2]])
+    assert [line.split()[0] for line in run(capsys, "lineage", url, "abd")[1].splitlines()] == ["abc", "`-"]
+    scan = add_scan(database, [write_scan(tmp_path / "a.las", grid_points(100))]).scan.scan_id
+    assert run(capsys, "retire", url, scan[:6], "--reason", "wrong")[1] == f"retired: {scan}\n"
+    code, _, err = run(capsys, "retire", url, "ab", "--reason", "wrong")
+    assert (code, "ab: 2 maps and scans begin so (abc, abd)" in err) == (2, True)
+    assert run(capsys, "retire", url, "abc", "--reason", "wrong")[1] == "retired: abc, abd\n"
+    code, _, err = run(capsys, "retire", url, "x", "--reason", "wrong")
+    assert (code, "no map or scan x" in err) == (2, True)
 
 
 def test_sql_formats(db: str, capsys: pytest.CaptureFixture[str]) -> None:

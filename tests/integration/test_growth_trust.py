@@ -242,11 +242,12 @@ def test_a_trusted_owner_is_promoted_alone(tmp_path: Path) -> None:
 
 
 def test_what_is_retired_cannot_be_promoted(tmp_path: Path) -> None:
-    database = database_of(tmp_path, ANCHOR, strip_map("m", 45.0, owners=["anna"], parents=[ANCHOR], seed=1))
-    database.retire("m", "wrong")
+    mine = strip_map("mine", 45.0, owners=["anna"], parents=[ANCHOR], seed=1)
+    database = database_of(tmp_path, ANCHOR, mine)
+    database.retire("mine", "wrong")
     assert _promoted(database) == {}
-    with pytest.raises(StoreError, match="retired"):
-        promote_by_hand(database, "m", "again", force=True)
+    with pytest.raises(StoreError, match="map mine is retired"):
+        promote_by_hand(database, "mi", "again", force=True)
 
 
 def test_a_run_of_canaries_says_what_regressed() -> None:

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from numpy.testing import assert_allclose
+from pyproj import Transformer
 
 from featuredb.cli.main import main
 from featuredb.errors import (
@@ -118,7 +120,6 @@ def test_header_boxes_that_lie_are_not_believed(database: Database, tmp_path: Pa
 
 
 def test_ortho_colours_what_is_seen_from_above(database: Database, tmp_path: Path) -> None:
-    rasterio = pytest.importorskip("rasterio")
     ground = grid_points(10_000, 3, spacing=0.5)
     roof = ground[(np.abs(ground[:, :2] - [WEST + 25, SOUTH + 25]) < 5).all(axis=1)] + [0.0, 0.0, 6.0]
     path = write_scan(tmp_path / "a.laz", np.concatenate([ground, roof]))
@@ -154,6 +155,61 @@ def test_ortho_colours_what_is_seen_from_above(database: Database, tmp_path: Pat
         assert colour[high].mean() > 0.99
         assert colour[below].mean() < 0.01  # the lawn under the roof keeps its own: none
         assert colour[inside & ~below & ~high].mean() > 0.9
+
+
+def test_an_image_of_another_place_is_refused_and_what_one_colours_is_told(
+    database: Database, tmp_path: Path
+) -> None:
+    heights = np.full((30, 40, 1), 200.0, np.float32)
+    place = {"epsg": 32632, "west": WEST, "north": SOUTH + 30.0, "pixel_m": 1.0}
+    write_geotiff(tmp_path / "dsm.tif", heights, **place)
+    grey = np.full((30, 40, 1), 90, np.uint8)
+    west, north = Transformer.from_crs(32632, 32633, always_xy=True).transform(WEST + 5000, SOUTH)
+    write_geotiff(tmp_path / "away.tif", grey, epsg=32633, west=west, north=north, pixel_m=1.0)
+    write_geotiff(tmp_path / "half.tif", grey, **{**place, "west": WEST + 20.0})
+    write_geotiff(tmp_path / "empty.tif", 0 * grey, **place, nodata=0)
+    dsm = [tmp_path / "dsm.tif"]
+
+    said = rf"away\.tif: expected an image of the scan's place, .*, found one of \[{west:.2f}.*--ortho-crs"
+    with pytest.raises(ScanError, match=said):
+        add_scan(database, dsm, ortho=tmp_path / "away.tif")
+    assert not Path(database.url).exists()
+    half = add_scan(database, dsm, ortho=tmp_path / "half.tif").scan
+    assert (half.colour, half.row["notes"]) == ("ortho", ["the ortho image colours 50.0% of the points"])
+    empty = add_scan(database, dsm, ortho=tmp_path / "empty.tif").scan
+    assert (empty.colour, empty.row["notes"]) == ("", ["the ortho image colours 0.0% of the points"])
+
+
+def test_heights_that_no_place_on_earth_has_are_in_another_unit(database: Database, tmp_path: Path) -> None:
+    heights = np.linspace(11_000, 15_000, 1200, dtype=np.float32).reshape(30, 40, 1)  # centimetres
+    dsm = tmp_path / "dsm.tif"
+    write_geotiff(dsm, heights, epsg=32632, west=WEST, north=SOUTH + 30.0, pixel_m=1.0)
+    said = (
+        r"dsm\.tif: expected heights between -11000 and 9000 m, found 11000 to 15000 m by .*--height-unit.*"
+    )
+    with pytest.raises(GeodesyError, match=said + "-scale 0.01"):
+        add_scan(database, [dsm])
+    assert not Path(database.url).exists()
+    add_scan(database, [dsm], AddOptions(height_unit="ft"))
+    with rasterio.open(dsm, "r+") as file:
+        file.scales = (0.01,)
+    scan = add_scan(database, [dsm]).scan
+    assert (scan.box.min_height, scan.box.max_height) == pytest.approx((110.0, 150.0))
+
+
+def test_files_of_several_units_are_told_one_by_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    metres = write_scan(tmp_path / "m.las", grid_points(400, spacing=1.0))
+    xyz = grid_points(400, seed=1, spacing=1.0)
+    feet = np.column_stack([xyz[:, :2], xyz[:, 2] / 0.3048])
+    write_scan(tmp_path / "ft.las", feet, crs="EPSG:32632+8228")  # NAVD88 height (ft)
+    db = str(tmp_path / "scans.db")
+    files = [str(metres), str(tmp_path / "ft.las")]
+    assert main(["lidar", "add", db, *files, "--height-datum", "navd88", "--quiet"]) == 0
+    out = capsys.readouterr().out
+    assert "m.las has X, Y in metre, Z in metre (" in out
+    assert "ft.las has X, Y in metre, Z in foot (unit of the vertical CRS " in out
 
 
 @pytest.mark.parametrize("package", ["laspy", "lazrs"])

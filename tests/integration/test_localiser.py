@@ -73,6 +73,7 @@ def test_a_database_serves_its_active_maps_only(
     only = first.localise(photo, replace(KNOWN, map_ids=("field",)))
     assert only.pose is not None
     assert only.pose.map_ids == ("field",)
+    assert first.localise(photo, replace(KNOWN, map_ids=("fi",))).pose is not None  # first letters are enough
     for wrong in ("nowhere", "held"):
         with pytest.raises(MapNotFoundError, match=wrong):
             first.localise(photo, replace(KNOWN, map_ids=(wrong,)))

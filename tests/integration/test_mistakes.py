@@ -25,6 +25,8 @@ from tests.conftest import REPOSITORY
 from tests.support import planar_map as field
 from tests.support.films import film
 
+_NO_CA = '{mode: "client", transport: {link: {tls: {root_ca_certificate: "gone/ca.pem"}}}}'
+
 # Command, and what its line has to say. {port} is one at which nobody listens.
 MISTAKES = {
     "a camera model that does not exist": (
@@ -46,6 +48,18 @@ MISTAKES = {
     "a scan that is not there": (
         "lidar add new.db missing.laz",
         r"missing.laz: expected a LAS, LAZ or COPC file, found none; check the path",
+    ),
+    "a folder in place of its scans": (
+        "lidar add new.db .",
+        r"\.: expected a LAS, LAZ or COPC file, found a folder; name those in it, such as scan\.las",
+    ),
+    "a folder without scans": (
+        "lidar add new.db texts",
+        r"texts: expected a LAS, LAZ or COPC file, found a folder; it has no \.las, \.laz or \.tif",
+    ),
+    "a scan that is cut off": (
+        "lidar add new.db cut/scan.laz --crs EPSG:32632",
+        r"cut/scan\.laz: expected a readable LAS, LAZ or COPC file, found one that is truncated or broken",
     ),
     "a scan without a coordinate system": (
         "lidar add new.db scan.las",
@@ -82,6 +96,10 @@ MISTAKES = {
     "a configuration that is cut off": (
         "live film.mp4 --config cut.json5",
         r"--config: .* in cut.json5, found: at 1:7 expected array",
+    ),
+    "a certificate that is not there": (
+        "query photos/a.jpg --config tls.json5",
+        r"--config: tls.json5: tls/root_ca_certificate: expected a file .* none at gone/ca.pem",
     ),
     "a gateway by an empty configuration": (
         "gateway --port 0 --config empty.json5",
@@ -153,7 +171,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "film.gif").write_bytes(b"GIF89a and so on")
     film(here, "mp4")
     (here / "overlay-a.png").write_text("no photo")
-    for name, text in (("pose.json", ""), ("empty.json5", ""), ("cut.json5", "{mode:")):
+    for name, text in (
+        ("pose.json", ""),
+        ("empty.json5", ""),
+        ("cut.json5", "{mode:"),
+        ("tls.json5", _NO_CA),
+    ):
         (here / name).write_text(text)
     for name in ("link.mp4", "link.csv"):
         (here / name).symlink_to("film.mp4")
@@ -162,6 +185,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = np.array([456_800.0, 5_429_300.0, 100.0]) + np.random.default_rng(0).uniform(0, 50, (100, 3))
     scan.x, scan.y, scan.z = place.T
     scan.write(str(here / "scan.las"))
+    (here / "cut").mkdir()
+    scan.write(str(here / "cut" / "scan.laz"))
+    (here / "cut" / "scan.laz").write_bytes((here / "cut" / "scan.laz").read_bytes()[:-400])
     Database.create(here / "field.db").commit_map(field.planar_map())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("featuredb.store.durable.making.FORMAT_VERSION", 999)

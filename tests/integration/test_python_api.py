@@ -1,5 +1,6 @@
 """`featuredb.open` as a notebook uses it: photos in every form, one index, tables, pictures, refusals."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -175,6 +176,8 @@ def test_what_cannot_be_done_is_said_in_one_sentence(url: Path, tmp_path: Path) 
             featuredb.open(None, create=create)  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="expected a path, found 5"):
         db.ingest(5)  # type: ignore[arg-type]
+    with pytest.raises(ImageError, match="cannot be read: embedded null byte"):
+        db.localise("a\0b")
     with pytest.raises(StoreError, match="found None"):
         db.sql(None)  # type: ignore[arg-type]
     with pytest.raises(ExportError, match="found bogus"):
@@ -192,6 +195,28 @@ def test_unknown_and_lonely_choices_of_an_ingest_are_refused_before_any_work(url
         db.ingest(url.parent, gcp_file="gcp_list.txt")  # type: ignore[call-arg]
     with pytest.raises(InvalidValueError, match="gcp_crs: expected gcp beside it"):
         db.ingest(url.parent, gcp_crs="EPSG:32632")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda db: featuredb.open("a\0b"), r"expected a folder or an address in an object store, found 'a"),
+        (lambda db: db.ingest("a\0b"), r"expected a path, found 'a"),
+        (lambda db: db.ingest("photos", workers="a"), "ingest: workers: expected a whole number, found 'a'"),
+        (lambda db: db.ingest("photos", gps_sigma=5), "ingest: gps_sigma: expected two numbers in metres"),
+        (lambda db: db.ingest("photos", exclude=5), "ingest: exclude: expected globs"),
+        (lambda db: db.align("field", photos="photos", near=5), "expected LAT,LON .*, found '5'"),
+        (lambda db: db.align(5, by_maps=True), "align: map_id: expected the id of a map, found 5"),
+        (lambda db: db.track("f.mp4", prior=(47.0, 8.0, 5.0)), r"track: prior: expected .*\.GeoPrior, found"),
+        (lambda db: db.grow(5), r"grow: options: expected .*\.GrowingOptions, found 5"),
+        (lambda db: db.export("x.ply", "ply", selection=5), r"expected .*\.Selection, found 5"),
+    ],
+)
+def test_arguments_of_a_wrong_kind_are_refused_at_the_entrance(
+    url: Path, wrong: Callable[[featuredb.FeatureDatabase], object], said: str
+) -> None:
+    with pytest.raises(InvalidValueError, match=said):
+        wrong(featuredb.open(url))
 
 
 @pytest.mark.parametrize("prior", [(47.0, 8.0), (47.0, 8.0, "near")])

@@ -3,13 +3,14 @@
 import json
 import socket
 import threading
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
 import zenoh
 
-from featuredb.errors import IncompatibleExtractorError, ServiceError
+from featuredb.errors import IncompatibleExtractorError, ServiceError, StoreError
 from featuredb.geo.utm import utm_from_geodetic
 from reloc.client import NO_SERVER, TIMEOUT, CameraRequest, Client, PriorRequest
 from reloc.service.options import ServeOptions
@@ -322,13 +323,21 @@ def test_the_client_s_own_timeout_is_an_error_of_its_own(shared_server):
 def test_a_taken_port_stops_the_start_with_a_clear_error():
     with running_server(ScriptedLocaliser(1)) as server:
         port = server.endpoints[0].rsplit(":", 1)[1]
+        source = MemorySource(area_of(ScriptedLocaliser(1)))
         with pytest.raises(ServiceStartError, match=r"is another server running there\?") as caught:
-            Server.start(
-                MemorySource(area_of(ScriptedLocaliser(1))),
-                ServeOptions(listen=(f"tcp/127.0.0.1:{port}",)),
-                "town",
-            )
+            Server.start(source, ServeOptions(listen=(f"tcp/127.0.0.1:{port}",)), "town")
     assert port in str(caught.value)
+    assert source.loads == 0  # it is told before the time is taken to load maps
+
+
+def test_a_server_whose_maps_cannot_be_loaded_listens_no_longer():
+    source = MemorySource(area_of(ScriptedLocaliser(1)))
+    source.load = Mock(side_effect=StoreError("no such table"))
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    with pytest.raises(StoreError, match="no such table"):
+        Server.start(source, ServeOptions(listen=(f"tcp/127.0.0.1:{port}",)), "town")
+    socket.create_server(("127.0.0.1", port)).close()
 
 
 def test_liveliness_tokens_advertise_the_server_and_its_tiles(shared_server):

@@ -3,6 +3,7 @@
 import csv
 import json
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from tests.support.hill_walk import anchored_database
 from tests.support.made_once import made_once
 from tests.support.planar_map import field_texture
 from tests.support.tracked_film import FRAMES, film_frames, pose_at
+
+Track = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
@@ -39,20 +42,30 @@ def folder(anchored: Path, film: list[np.ndarray], tmp_path_factory: pytest.Temp
     return folder
 
 
+@pytest.fixture
+def track(
+    anchored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Track:
+    """Tracks a film, by its path and options, from an empty folder; exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(film: Path, *words: str) -> tuple[int, str, str]:
+        code = main(["track", str(anchored), str(film), *words])
+        return code, *capsys.readouterr()
+
+    return run
+
+
 _LENS = f"{CAMERA.model},{CAMERA.width},{CAMERA.height},{','.join(map(str, CAMERA.params))}"
 
 
-def test_the_command_tracks_a_film(
-    anchored: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_tracks_a_film(folder: Path, tmp_path: Path, track: Track) -> None:
     files = [tmp_path / f"out/track.{kind}" for kind in ("csv", "tum", "geojson", "kml", "json")]
     outs = [text for file in files for text in ("--out", str(file))]
     overlay = tmp_path / "overlay.mp4"
     drawn_to = ["--overlay", str(overlay)]
-    code = main(
-        ["track", str(anchored), str(folder / "film.mp4"), *outs, "--camera", _LENS, "--json", *drawn_to]
-    )
-    summary = json.loads(capsys.readouterr().out)
+    code, out, _ = track(folder / "film.mp4", *outs, "--camera", _LENS, "--json", *drawn_to)
+    summary = json.loads(out)
     assert code == 0
     assert summary["frames"] == FRAMES
     assert summary["written"] == [*map(str, files), str(overlay)]
@@ -75,16 +88,13 @@ def test_the_command_tracks_a_film(
         assert sum(1 for _ in drawn) == FRAMES
 
 
-def test_a_film_of_elsewhere_gives_a_table_of_reasons(
-    anchored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_film_of_elsewhere_gives_a_table_of_reasons(tmp_path: Path, track: Track) -> None:
     other = field_texture(9)
     with VideoWriter(tmp_path / "film.mp4", width=CAMERA.width, height=CAMERA.height, fps=30.0) as writer:
         for i in range(10):
             writer.write(_render(other, pose_at(i), i))
-    out = ["--out", str(tmp_path / "t.csv"), "--out", str(tmp_path / "t.kml")]
-    assert main(["track", str(anchored), str(tmp_path / "film.mp4"), *out]) == 1
-    said = capsys.readouterr().out
+    code, said, _ = track(tmp_path / "film.mp4", "--out", "t.csv", "--out", "t.kml")
+    assert code == 1
     assert "10 frames, 0 tracked, 0 relocalised, 10 lost" in said
     assert {row["state"] for row in csv.DictReader((tmp_path / "t.csv").read_text().splitlines())} == {"lost"}
     assert not (tmp_path / "t.kml").exists()
@@ -102,27 +112,16 @@ def test_a_film_of_elsewhere_gives_a_table_of_reasons(
     ],
 )
 def test_bad_requests_say_what_is_wrong_and_write_nothing(
-    change: list[str],
-    message: str,
-    anchored: Path,
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    change: list[str], message: str, folder: Path, tmp_path: Path, track: Track
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    overlay = ["--overlay", "o.mp4"]
-    assert main(["track", str(anchored), str(folder / "film.mp4"), *change, *overlay]) not in (0, 1)
-    assert message in capsys.readouterr().err
+    code, _, said = track(folder / "film.mp4", *change, "--overlay", "o.mp4")
+    assert code not in (0, 1)
+    assert message in said
     assert not list(tmp_path.iterdir())
 
 
 def test_what_cannot_be_drawn_is_tracked(
-    anchored: Path,
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    folder: Path, tmp_path: Path, track: Track, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that is full, and a hand that ends the film."""
 
@@ -131,19 +130,17 @@ def test_what_cannot_be_drawn_is_tracked(
         raise VideoError("o.mp4: the film cannot be written: No space left on device")
 
     monkeypatch.setattr(VideoWriter, "write", full)
-    words = ["--out", str(tmp_path / "t.csv"), "--overlay", str(tmp_path / "o.mp4")]
-    assert main(["track", str(anchored), str(folder / "film.mp4"), *words]) == 2
-    said = capsys.readouterr().err
+    code, _, said = track(folder / "film.mp4", "--out", "t.csv", "--overlay", "o.mp4")
+    assert code == 2
     assert "o.mp4: the film cannot be written" in said
     assert "stopped by hand; what was written is a part" in said
     assert [file.name for file in tmp_path.iterdir()] == ["t.csv"]
 
 
-def test_a_broken_film_says_so_and_writes_nothing(
-    anchored: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_broken_film_says_so_and_writes_nothing(folder: Path, tmp_path: Path, track: Track) -> None:
     broken = tmp_path / "broken.mp4"
     broken.write_bytes((folder / "film.mp4").read_bytes()[:2000])
-    assert main(["track", str(anchored), str(broken), "--out", str(tmp_path / "t.csv")]) == 2
-    assert "broken.mp4" in capsys.readouterr().err
+    code, _, said = track(broken, "--out", "t.csv")
+    assert code == 2
+    assert "broken.mp4" in said
     assert [f.name for f in tmp_path.iterdir()] == ["broken.mp4"]

@@ -207,6 +207,16 @@ def test_the_command_writes_a_file_without_the_extra(
     assert (code, "pip install 'featuredb[http]'" in err) == (2, True)
 
 
+def test_a_taken_port_is_told_before_the_scene_is_built(
+    varied: Database, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reloc.viewer.scene.build_scene", lambda *given: 1 / 0)
+    with listen(HOST, 0) as bound:
+        port = bound.getsockname()[1]
+        code, _, err = run(capsys, "view", varied.url, "--no-browser", "--port", str(port))
+    assert (code, f"cannot listen on {HOST}:{port}: " in err) == (2, True), err
+
+
 @pytest.mark.parametrize(
     ("argv", "said"),
     [

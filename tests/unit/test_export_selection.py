@@ -47,6 +47,7 @@ def test_by_status_and_by_id(database: Database) -> None:
     assert ids(database, Selection()) == ["one", "two"]
     assert ids(database, Selection(statuses=("quarantined",))) == ["three"]
     assert ids(database, Selection(maps=("three", "one"))) == ["one", "three"]
+    assert ids(database, Selection(maps=("th", "o"))) == ["one", "three"]
     with pytest.raises(MapNotFoundError, match="four"):
         ids(database, Selection(maps=("four",)))
     database.retire("one", "test")

@@ -52,6 +52,7 @@ def test_heights_of_zero_are_unknown_only_where_all_are() -> None:
         (_MARK.format(z=1), "line 1: expected the reference system"),
         ("EPSG:1\n" + _MARK.format(z=1), "line 1: expected a coordinate reference system"),
         ("EPSG:32632\n1,2,3,4,5,a.jpg", "line 2: expected at least 6 columns .* not commas"),
+        ("EPSG:32632\n1,5;2;3;4;5;a.jpg", "line 2: expected at least 6 columns .* not semicolons"),
         ("EPSG:32632\n\n1 2 3 4 5", "line 3: expected at least 6 columns .* found 5"),
         ("EPSG:32632\n" + _MARK.format(z="high"), "line 2: expected a number as geo_z, found 'high'"),
         ("EPSG:32632\n456800 5429300 0 -4 20 a.jpg", "line 2: expected pixels >= 0"),

@@ -7,9 +7,10 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from featuredb.errors import IngestError
+from featuredb.features.exif.write import gps_directory
 from ingest.photos.scan import ScanOptions, scan_table
 from ingest.photos.table import is_table, read_table, summary_of
 
@@ -151,6 +152,22 @@ def test_what_the_table_says_of_heights_goes_before_exif(tmp_path: Path) -> None
     assert two is not None
     assert (one.height_m, one.sigma_horizontal_m, one.sigma_vertical_m) == (123.45, 0.02, 0.03)
     assert (two.height_m, two.sigma_horizontal_m, two.sigma_vertical_m) == (130.0, 2.0, 5.0)
+
+
+def test_a_table_of_another_place_than_exif_is_told_with_the_distance(tmp_path: Path) -> None:
+    for number, name in enumerate(("one.jpg", "two.jpg", "three.jpg")):
+        exif = Image.Exif()
+        if number < 2:
+            exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps_directory((48.0, 8.0, 100.0)))
+        Image.new("L", (320, 240), 9 * number).save(tmp_path / name, exif=exif)
+    table = tmp_path / "photos.csv"
+    head, rest = "path,lat,lon\none.jpg,48.1,8\n", "two.jpg,48.001,8\nthree.jpg,50,8\n"
+    table.write_text(head + rest)
+    (note,) = scan_table(read_table(table)).notes
+    # 0.1 degrees along the meridian are 11.12 km there
+    assert "1 of 2 photos lie more than 1 km from the positions in their EXIF, one.jpg by 11.1 km" in note
+    table.write_text("path,lat,lon\n" + rest)
+    assert scan_table(read_table(table)).notes == ()
 
 
 def test_the_cameras_angles(tmp_path: Path) -> None:

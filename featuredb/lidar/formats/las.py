@@ -4,6 +4,7 @@ A file is read as a stream, so its size does not matter. Whatever is wrong with 
 that names the file: what was expected, what was found, what to do.
 """
 
+import logging
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -83,6 +84,12 @@ def open_scan_file(path: Path) -> ScanFile:
             itself.
         MissingExtraError: laspy is not installed.
     """
+    if path.is_dir():
+        inside = sorted(
+            p.name for p in path.iterdir() if p.suffix.lower() in (".las", ".laz", ".tif", ".tiff")
+        )
+        what = f"name those in it, such as {inside[0]}" if inside else "it has no .las, .laz or .tif"
+        raise ScanFileError(f"{path}: expected a LAS, LAZ or COPC file, found a folder; {what}")
     if not path.is_file():
         raise ScanFileError(f"{path}: expected a LAS, LAZ or COPC file, found none; check the path")
     size = path.stat().st_size
@@ -151,6 +158,7 @@ def import_laspy(purpose: str = "Reading scans") -> ModuleType:
     require("lidar", purpose, "laspy", "lazrs")
     import laspy
 
+    logging.getLogger("laspy").setLevel(logging.CRITICAL)  # it logs what it raises as well
     module: ModuleType = laspy
     return module
 

@@ -129,11 +129,15 @@ def _question(snapshot: Snapshot, database: Database, options: GrowthOptions, ne
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
     """Promote one map without confirmation; canaries are asked, and refuse it unless forced.
 
+    Args:
+        map_id: or its first letters, if no other map begins so.
+
     Raises:
         MapNotFoundError, StoreError: it is retired, or no active map holds it.
         ConflictError: it was changed by someone else meanwhile.
     """
     snapshot = database.snapshot()
+    map_id = snapshot.find(map_id, include_retired=True).map_id
     summary = snapshot.get(map_id)
     if summary.status == "active":
         return Promotion(map_id=map_id, promoted=True, reason="it was active already")

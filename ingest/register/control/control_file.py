@@ -138,7 +138,8 @@ def _parse_line(number: int, line: str, crs: SurveyCrs) -> tuple[Mark, _Place]:
     if len(fields) < 6:  # by tabs where they make enough columns, since names of photos may hold spaces
         fields = line.split()
     if len(fields) < 6:
-        hint = "; separate columns by spaces or tabs, not commas" if line.count(",") >= 5 else ""
+        signs = [name for sign, name in ((",", "commas"), (";", "semicolons")) if line.count(sign) >= 5]
+        hint = f"; separate columns by spaces or tabs, not {signs[-1]}" if signs else ""
         raise ControlFileError(
             f"line {number}: expected at least 6 columns ({_COLUMNS}), found {len(fields)}{hint}"
         )

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
+from featuredb.geo.words import way_words
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.render.cloud import PointCloud
@@ -140,7 +141,10 @@ def _views(
     if look is not None and look.cover >= MIN_COVER:
         return FrameViews(gray, camera, cloud, look, options, clock)
     cover = 0.0 if look is None else look.cover
-    words = f"the scan covers {100 * cover:.0f} % of what the prior sees; is it of this place?"
+    center = prior.cam_from_local.center[:2]
+    way = np.clip(center, cloud.xyz[:, :2].min(axis=0), cloud.xyz[:, :2].max(axis=0)) - center
+    beside = f" and lies {way_words(*way.tolist())} of the camera" if np.hypot(*way) >= 1.0 else ""
+    words = f"the scan covers {100 * cover:.0f} % of what the prior sees{beside}; is it of this place?"
     return _refused("NO_SCAN", words, clock, {"cover": cover})
 
 
