@@ -28,6 +28,7 @@ _FEW = 25_000
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
 _LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
 LISTS = 2048
+_AT_ONCE = 256  # descriptors that are compared with all lists: they make eight megabytes
 _CHUNK = 2_048  # descriptors at a time: bounds the copies
 
 
@@ -99,9 +100,9 @@ class DescriptorIndex:
                 faiss.swig_ptr(sorted_codes[start:end]),
             )
         index.ntotal = len(codes)
-        packed = faiss.IndexIVFPQFastScan(index)
-        packed.nprobe = _PROBES
-        return cls(packed)
+        packed = faiss.serialize_index(faiss.IndexIVFPQFastScan(index))
+        del index  # its lists lie between those of the other one, and would keep as much memory
+        return cls(_read(packed))
 
     @classmethod
     def exhaustive(cls, codes: DescriptorCodes) -> Self:
@@ -124,7 +125,9 @@ class DescriptorIndex:
 
     def _search(self, asked: NDArray[np.float32], k: int) -> NDArray[np.int64]:
         if hasattr(self._index, "nprobe"):
-            lists = np.argpartition(_from_lists(asked), _PROBES, axis=1)[:, :_PROBES].astype(np.int64)
+            lists = np.concatenate(
+                [_probed(part) for part in np.array_split(asked, len(asked) // _AT_ONCE + 1)]
+            )
             _, row = self._index.search_preassigned(asked, k, lists, np.zeros(lists.shape, np.float32))
         else:
             parts = np.array_split(asked, min(opencv_threads(), len(asked)))
@@ -182,6 +185,12 @@ def _from_lists(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(squared)
 
 
+def _probed(descriptors: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The lists (n, _PROBES) that descriptors (n, 128) are looked for in."""
+    order = np.argpartition(_from_lists(descriptors), _PROBES, axis=1)
+    return order[:, :_PROBES].astype(np.int64)  # a copy, since `order` is large
+
+
 @cache
 def _list_centers() -> Any:
     """The index of the lists' centres (2048, 128), which all indexes share."""
@@ -198,7 +207,14 @@ def _shipped(name: str) -> NDArray[np.float32]:
 
 
 def _of_bytes(data: NDArray[np.uint8]) -> DescriptorIndex:
-    return DescriptorIndex(faiss.deserialize_index(data))
+    return DescriptorIndex(_read(data))
+
+
+def _read(data: NDArray[np.uint8]) -> Any:
+    index = faiss.deserialize_index(data)
+    if hasattr(index, "nprobe"):
+        index.nprobe = _PROBES
+    return index
 
 
 @cache
