@@ -37,7 +37,7 @@ if placed:
 else:
     pycolmap.match_exhaustive(database)
 models = pycolmap.incremental_mapping(database, photos, work).values()
-print(json.dumps(max(([m.image(i).name for i in m.reg_image_ids()] for m in models), key=len, default=[])))
+print(json.dumps([[m.image(i).name for i in m.reg_image_ids()] for m in models]))
 """
 
 
@@ -51,24 +51,28 @@ def main() -> None:
 
 
 def measured(folder: Path) -> dict[str, float]:
-    """Both programs over the photos of a folder: processor seconds, photos in the largest model or map and in
-    both, maps with a place."""
+    """Both programs over the photos of a folder: processor seconds; photos in any model or map, in the
+    largest, and in the largest of both; maps with a place."""
     with tempfile.TemporaryDirectory() as scratch:
         colmap = cost_of("-c", _THEIRS, str(folder), scratch)
         database = Path(scratch) / "db"
         words = ("ingest", "photos", str(database), str(folder), "--quiet")
         ours_s = cost_of("-m", "featuredb.cli", *words).seconds
         maps = all_maps(database)
-    theirs = set(json.loads(colmap.told.splitlines()[-1]))
-    ours = {image.name for image in max(maps, key=lambda one: len(one.images)).images}
+    models = {
+        "colmap": [set(names) for names in json.loads(colmap.told.splitlines()[-1])],
+        "ours": [{image.name for image in one.images} for one in maps],
+    }
+    largest = {whose: max(own, key=len, default=set[str]()) for whose, own in models.items()}
+    both = largest["colmap"] & largest["ours"]
     return {
         "colmap_s": colmap.seconds,
-        "colmap_photos": len(theirs),
         "ours_s": ours_s,
-        "ours_photos": len(ours),
+        **{f"{whose}_photos": len(set[str]().union(*own)) for whose, own in models.items()},
+        **{f"{whose}_largest": len(own) for whose, own in largest.items()},
         "ratio": ours_s / colmap.seconds,
-        "both": len(theirs & ours),
-        "share": len(theirs & ours) / max(1, len(theirs)),
+        "both": len(both),
+        "share": len(both) / max(1, len(largest["colmap"])),
         "placed": sum(isinstance(one, FeatureMap) for one in maps),
     }
 

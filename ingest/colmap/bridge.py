@@ -298,27 +298,22 @@ def whole_model_of(reconstruction: Any) -> Model:
     """
     image_ids = sorted(reconstruction.reg_image_ids())
     camera_ids = sorted({reconstruction.image(i).camera_id for i in image_ids})
-    index_of_image = {image_id: k for k, image_id in enumerate(image_ids)}
-    xyz: list[FloatArray] = []
-    point_of: list[int] = []
-    photo_of: list[int] = []
-    keypoint_of: list[int] = []
-    for point_id in sorted(reconstruction.point3D_ids()):
-        point = reconstruction.point3D(point_id)
-        elements = sorted((index_of_image[e.image_id], e.point2D_idx) for e in point.track.elements)
-        point_of.extend([len(xyz)] * len(elements))
-        photo_of.extend(e[0] for e in elements)
-        keypoint_of.extend(e[1] for e in elements)
-        xyz.append(point.xyz)
+    points = [reconstruction.point3D(point_id) for point_id in sorted(reconstruction.point3D_ids())]
+    tracks = [point.track.elements for point in points]
+    point_of = np.repeat(np.arange(len(points)), [len(track) for track in tracks])
+    seen_by = np.array([element.image_id for track in tracks for element in track], dtype=np.int64)
+    photo_of = np.searchsorted(image_ids, seen_by)
+    keypoint_of = np.array([element.point2D_idx for track in tracks for element in track], dtype=np.int64)
+    order = np.lexsort((keypoint_of, photo_of, point_of))
     return Model(
         cameras=tuple(Camera.from_pycolmap(reconstruction.camera(c)) for c in camera_ids),
         rows=np.array(image_ids, dtype=np.int64) - 1,
         camera_of=np.array([camera_ids.index(reconstruction.image(i).camera_id) for i in image_ids]),
         cam_from_sfm=tuple(_pose(reconstruction.image(i).cam_from_world()) for i in image_ids),
-        xyz=np.array(xyz, dtype=np.float64).reshape(-1, 3),
-        point_of=np.array(point_of, dtype=np.int64),
-        photo_of=np.array(photo_of, dtype=np.int64),
-        keypoint_of=np.array(keypoint_of, dtype=np.int64),
+        xyz=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        point_of=point_of[order],
+        photo_of=photo_of[order],
+        keypoint_of=keypoint_of[order],
     )
 
 

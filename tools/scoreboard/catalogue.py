@@ -51,9 +51,10 @@ SPEED: tuple[Row, ...] = (
         + " ".join(f"{{data}}/{name}/images" for name in _INGESTED[1:])
         + f" {OUT}",
         figures=" ".join(f"{photos}_ours_s {photos}_colmap_s" for photos in _INGESTED),
-        text="times COLMAP's time, photos in a map, COLMAP's photos: "
+        text="times COLMAP's time, photos registered (in the largest map), COLMAP's: "
         + ", ".join(
-            f"{{{name}_ratio:.2f}} {{{name}_ours_photos:.0f}} {{{name}_colmap_photos:.0f}}"
+            f"{{{name}_ratio:.2f}} {{{name}_ours_photos:.0f}} ({{{name}_ours_largest:.0f}}) "
+            f"{{{name}_colmap_photos:.0f}} ({{{name}_colmap_largest:.0f}})"
             for name in _INGESTED
         ),
         limits="worst_ratio <= 0.5, fewer <= 0",
