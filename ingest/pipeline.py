@@ -275,10 +275,15 @@ def _commit(database: Database, batch: Sequence[Component], options: IngestOptio
     maps = [m for c in batch if (m := c.feature_map or c.unplaced) is not None]
     if options.stop_after == "build":
         return []
-    if maps:
+    retired = database.snapshot().retired_alike(maps)
+    if kept := [m for m in maps if m.map_id not in retired]:
         reasons = {c.feature_map.map_id: c.reason for c in batch if c.feature_map is not None}
-        created = {r.map_id: r.created for r in database.commit_maps(maps, reasons=reasons)}
-    return [map_outcome(c, created, options.making) for c in batch]
+        created = {r.map_id: r.created for r in database.commit_maps(kept, reasons=reasons)}
+    outcomes = [map_outcome(c, created, options.making) for c in batch]
+    return [
+        replace(one, status="retired", reason=retired[one.map_id]) if one.map_id in retired else one
+        for one in outcomes
+    ]
 
 
 def _quarantine_note(quarantined: Mapping[str, str]) -> tuple[str, ...]:

@@ -30,6 +30,10 @@ def run_import(args: argparse.Namespace) -> None:
     )
     would = "would import" if done.dry_run else "imported"
     lines = [f"{would} {len(done.created)} maps; {len(done.present)} were there already"]
+    lines += [
+        f"{map_id}: is retired here ({why}) and stays so; `featuredb promote` takes it into service again"
+        for map_id, why in done.retired.items()
+    ]
     if done.quarantined and not args.trusted:
         lines.append(
             f"{len(done.quarantined)} of them in quarantine, because nobody here has vouched for them: "

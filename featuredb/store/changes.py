@@ -174,7 +174,7 @@ def change_status(
         if known[map_id]["status"] == UNPLACED:
             raise StoreError(f"map {map_id} has no place, so it cannot be {status}; place it first")
         if known[map_id]["status"] == RETIRED:
-            raise StoreError(f"map {map_id} is retired ({known[map_id]['status_reason']}); commit it again")
+            raise StoreError(f"map {map_id} is retired ({known[map_id]['status_reason']}); promote it")
     wanted = [m for m in dict.fromkeys(map_ids) if known[m]["status"] != status]
     if not wanted:
         return Change(rows=list(rows), added=()), []

@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -21,7 +21,7 @@ from featuredb.store.changes import RETIRED
 from featuredb.store.decode import decode_images, decode_map, decode_no_place, frame_of, has_place, of_columns
 from featuredb.store.delta import Condition, Table
 from featuredb.store.durable.filesystem import read_errors
-from featuredb.store.encode import Row
+from featuredb.store.encode import Row, content_digest
 from featuredb.store.tables import BOUNDS, CHILD_TABLES, IMAGES, SPECS, UTM_COORDINATES
 
 
@@ -128,6 +128,15 @@ class Snapshot:
     def any_maps(self, *, include_retired: bool = False) -> list[MapSummary | UnplacedSummary]:
         """All maps, oldest first."""
         return [self.get_any(row["map_id"]) for row in self._oldest_first(include_retired)]
+
+    def retired_alike(self, maps: Iterable[AnyMap]) -> dict[str, str]:
+        """Why those of some maps are retired that were with the same content, by id."""
+        rows = {map_id: row for map_id, row in self._rows.items() if row["status"] == RETIRED}
+        return {
+            m.map_id: rows[m.map_id]["status_reason"]
+            for m in maps
+            if m.map_id in rows and rows[m.map_id]["content_digest"] == content_digest(m)
+        }
 
     def maps(self, *, include_retired: bool = False) -> list[MapSummary]:
         """Those of `any_maps` with a place."""

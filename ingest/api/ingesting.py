@@ -183,6 +183,11 @@ def summary(report: IngestReport) -> str:
     for outcome in report.maps:
         if outcome.status == "refused":
             lines.append(f"refused: {outcome.name}: {outcome.reason_code}: {outcome.reason}")
+        elif outcome.status == "retired":
+            way = "; `featuredb promote` takes it into service again" if outcome.epsg else ""
+            lines.append(
+                f"map {outcome.map_id} ({outcome.name}): was retired ({outcome.reason}) and stays so{way}"
+            )
         elif outcome.status == "unplaced":
             lines += [
                 f"map {outcome.map_id} ({outcome.name}): without a place, {outcome.photos} photos, "

@@ -160,7 +160,7 @@ def run_photos(args: argparse.Namespace) -> int:
 
 
 def ingest_folder(args: argparse.Namespace, folder: Path, films: Sequence["FilmOutcome"] = ()) -> int:
-    """Ingest, print what happened; 0 if a map is in the database, 1 if none could be made.
+    """Ingest, print what happened; 0 if a map is in the database, 1 if none is.
 
     Args:
         films: whose keyframes the folder holds, a folder for each.
@@ -176,5 +176,5 @@ def ingest_folder(args: argparse.Namespace, folder: Path, films: Sequence["FilmO
     database = Database.create(args.db, storage_options=storage_options(args))
     report = ingest(database, folder, options, films, report=args.report, quiet=args.quiet)
     sys.stdout.write(summary(report))
-    made = any(outcome.status != "refused" for outcome in report.maps)
+    made = any(outcome.status not in ("refused", "retired") for outcome in report.maps)
     return 0 if made or args.stop_after else 1

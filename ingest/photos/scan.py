@@ -27,7 +27,7 @@ from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.photos.duplicates import MAX_BITS, exact_duplicates, near_duplicates, picture_hash
 from ingest.photos.photo import Photo
-from ingest.photos.table import PhotoTable, TableRow, is_table, summary_of
+from ingest.photos.table import PhotoTable, TableRow, is_table, read_table, summary_of
 from ingest.photos.walk import ExaminedFile, FoundFile, read_cache, refused, walk, write_cache
 
 # Raised when the same file would be judged differently, so that old caches are not used.
@@ -351,12 +351,13 @@ def _skipped(photo: Photo, code: str, reason: str, duplicate_of: str) -> Photo:
 
 
 def require_photos(folder: Path) -> None:
-    """Before a database is made for them: does anything begin as a photo? A table is not looked into.
+    """Before a database is made for them: does anything begin as a photo? Of a table, is it one?
 
     Raises:
-        IngestError: no folder, or nothing in it does.
+        IngestError: no folder, nothing in it does, or the table cannot be read.
     """
     if is_table(folder):
+        read_table(folder)
         return
     found = [file for file in walk(folder) if not file.reason_code]
     if not any(_begins_as_photo(file.path) for file in found):

@@ -27,6 +27,7 @@ _MAP_PILLS = {
     "committed": ("good", "committed"),
     "already_there": ("good", "was there already"),
     "unplaced": ("fair", "kept without a place"),
+    "retired": ("fair", "retired before, and stays so"),
     "refused": ("bad", "refused"),
 }
 # As `ingest.register.gps` names them; those of `angles` stand below it there. What has no line is not shown.

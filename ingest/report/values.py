@@ -16,7 +16,7 @@ from ingest.register.control.placement import GcpPlacement
 from ingest.report.films import FilmOutcome
 
 FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
-MapOutcomeStatus = Literal["committed", "already_there", "unplaced", "refused"]
+MapOutcomeStatus = Literal["committed", "already_there", "unplaced", "retired", "refused"]
 SCHEMA_ID = "featuredb/ingest/report/1"
 
 # EXIF rounds to whole millimetres of 35 mm equivalent (2.5 % at 20 mm) and makers count the frame differently
@@ -111,8 +111,8 @@ class MapOutcome:
     Attributes:
         map_id: "" where it was refused.
         status: committed, already_there (an earlier run committed it), unplaced (kept without a place),
-            refused.
-        reason_code, reason: why it was refused or has no place.
+            retired (somebody has taken this very map out of service, and it stays so), refused.
+        reason_code, reason: why it was refused or retired, or has no place.
         gates: figures of every gate, JSON-able.
         scale: metres per unit of the reconstruction.
         residual_rms_m: of the GPS positions that were used.

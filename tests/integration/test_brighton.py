@@ -11,6 +11,8 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.store import Database
+from ingest.api.ingesting import summary as summary_text
+from ingest.growth.trust.promotion import promote_by_hand
 from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
@@ -80,6 +82,22 @@ def test_the_same_ingest_again_changes_nothing(
     assert {p.name for p in again.photos if p.status == "skipped"} == set(_HELD_OUT)
     assert [m.status for m in again.maps] == ["already_there"]
     assert [s.reused == s.total for s in again.stages if s.total] == [True] * 4
+
+
+def test_what_was_retired_stays_so_when_its_photos_are_ingested_again(
+    part: tuple[Database, IngestReport], photos: Path, options: IngestOptions
+) -> None:
+    database = part[0]
+    (summary,) = database.snapshot().maps()
+    database.retire(summary.map_id, "a wrong lens")
+    try:
+        again = ingest_photos(database, photos, options)
+        assert [(m.status, m.reason) for m in again.maps] == [("retired", "a wrong lens")]
+        assert "was retired (a wrong lens) and stays so; `featuredb promote`" in summary_text(again)
+        assert database.snapshot().maps() == []
+    finally:
+        assert promote_by_hand(database, summary.map_id, "the lens is right", force=True).promoted
+    assert [m.map_id for m in database.snapshot().maps()] == [summary.map_id]
 
 
 def test_a_photos_own_position_settles_which_of_two_places_it_shows(

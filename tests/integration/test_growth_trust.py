@@ -241,13 +241,18 @@ def test_a_trusted_owner_is_promoted_alone(tmp_path: Path) -> None:
     assert _promoted(database_of(tmp_path, ANCHOR, mine), trusted=("anna",))["m"].promoted
 
 
-def test_what_is_retired_cannot_be_promoted(tmp_path: Path) -> None:
+def test_what_is_retired_is_promoted_by_hand_alone_and_with_a_reason(tmp_path: Path) -> None:
     mine = strip_map("mine", 45.0, owners=["anna"], parents=[ANCHOR], seed=1)
     database = database_of(tmp_path, ANCHOR, mine)
     database.retire("mine", "wrong")
     assert _promoted(database) == {}
     with pytest.raises(StoreError, match="map mine is retired"):
-        promote_by_hand(database, "mi", "again", force=True)
+        database.set_status(["mine"], "active", "again")
+    with pytest.raises(StoreError, match="promote mi: expected a reason"):
+        promote_by_hand(database, "mi", " ", force=True)
+    assert database.snapshot().get("mine").status == "retired"
+    assert promote_by_hand(database, "mi", "it was right", force=False).promoted
+    assert database.snapshot().get("mine").status == "active"
 
 
 def test_a_run_of_canaries_says_what_regressed() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from featuredb.cli.main import main
 from featuredb.errors import ExportError
-from featuredb.export.dataset import import_dataset, read_dataset
+from featuredb.export.dataset import import_dataset, layout, read_dataset
 from featuredb.export.dataset.layout import write_sums
 from featuredb.export.selection import Selection
 from featuredb.store import Database
@@ -197,6 +197,51 @@ def test_another_map_of_the_same_id_is_not_touched(exported: Path, target: Datab
     target.retire("fiji", "gives way")
     assert "fiji" in import_dataset(target, exported).created
     assert target.snapshot().get("fiji").status == "quarantined"
+
+
+@pytest.mark.usefixtures("_command")
+def test_what_is_retired_here_stays_so(
+    exported: Path, target: Database, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import_dataset(target, exported, trusted=True)
+    target.retire("fiji", "a wrong lens")
+    done = import_dataset(target, exported, trusted=True)
+    assert done.retired["fiji"] == "a wrong lens"
+    assert "fiji" in done.present
+    assert target.snapshot().get("fiji").status == "retired"
+    assert main(["import", target.url, str(exported)]) == 0
+    assert "fiji: is retired here (a wrong lens) and stays so; `featuredb promote`" in capsys.readouterr().out
+
+
+def test_maps_that_came_before_a_broken_one_are_named(folder: Path, target: Database) -> None:
+    path = folder / layout.MAPS
+    rows = pq.read_table(path)
+    last = rows.column("map_id").to_pylist().index("fiji")
+    names = rows.column("name").to_pylist()
+    names[last] = "changed"
+    pq.write_table(rows.set_column(rows.schema.get_field_index("name"), "name", [names]), path)
+    rewritten(folder)
+    with pytest.raises(ExportError, match="map fiji: the files hold another map") as told:
+        import_dataset(target, folder)
+    there = [m.map_id for m in target.snapshot().any_maps(include_retired=True)]
+    assert ("imported before it" in str(told.value)) == bool(there)
+    assert all(map_id in str(told.value) for map_id in there)
+
+
+def test_a_table_that_lacks_values_or_columns_is_told_in_a_line(folder: Path, target: Database) -> None:
+    path = folder / layout.MAPS
+    rows = pq.read_table(path)
+    at = rows.schema.get_field_index("parents")
+    pq.write_table(rows.set_column(at, "parents", pa.nulls(len(rows), rows.schema.field(at).type)), path)
+    rewritten(folder)
+    with pytest.raises(ExportError, match=r"maps\.parquet: expected values in parents, some are missing"):
+        import_dataset(target, folder)
+    pq.write_table(rows.drop_columns(["status"]), path)
+    rewritten(folder)
+    with pytest.raises(ExportError, match="cannot read it") as told:
+        import_dataset(target, folder)
+    assert "\n" not in str(told.value)
+    assert target.poll_version() == 0
 
 
 def test_nothing_of_it_answers_before_somebody_vouches_for_it(

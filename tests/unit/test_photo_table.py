@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 
 from featuredb.errors import IngestError
 from featuredb.features.exif.write import gps_directory
-from ingest.photos.scan import ScanOptions, scan_table
+from ingest.photos.scan import ScanOptions, require_photos, scan_table
 from ingest.photos.table import is_table, read_table, summary_of
 
 _ROWS = [
@@ -183,3 +183,10 @@ def test_the_cameras_angles(tmp_path: Path) -> None:
     assert c.angles is None
     assert d.angles is None
     assert len(d.warnings) == 1
+
+
+def test_a_table_that_is_none_is_told_before_a_database_is_made(tmp_path: Path) -> None:
+    table = tmp_path / "positions.csv"
+    table.write_text("latitude,longitude\n46.8,-91.9\n")
+    with pytest.raises(IngestError, match="expected a column `path` or `id`"):
+        require_photos(table)

@@ -58,6 +58,9 @@ def open_dataset(folder: Path) -> tuple[list[Row], frozenset[str]]:
     layout.read_description(folder)
     wanted = [name for name in MAPS.schema.names if name not in ("created_at", "geometry", "bbox")]
     rows = read_table(folder / layout.MAPS, wanted).to_pylist()
+    empty = [n for n in wanted if not MAPS.schema.field(n).nullable and any(row[n] is None for row in rows)]
+    if empty:
+        raise ExportError(f"{folder / layout.MAPS}: expected values in {', '.join(empty)}, some are missing")
     cameras: dict[str, list[Row]] = defaultdict(list)
     for camera in read_table(folder / layout.CAMERAS, CAMERAS.schema.names).to_pylist():
         cameras[camera["map_id"]].append(camera)
@@ -121,7 +124,8 @@ def read_table(path: Path, columns: list[str] | None = None, only: ds.Expression
     try:
         return pq.read_table(path, columns=columns, filters=only, use_threads=False, partitioning=None)
     except (OSError, pa.ArrowException, KeyError) as error:
-        raise ExportError(f"{path}: expected a table of a dataset, cannot read it ({error})") from error
+        why = str(error).partition("\n")[0]  # Arrow's have the whole schema below
+        raise ExportError(f"{path}: expected a table of a dataset, cannot read it ({why})") from error
 
 
 def check_listed(name: str, listed: frozenset[str], folder: Path) -> None:
@@ -172,12 +176,14 @@ class Imported:
     Attributes:
         created: ids of maps that are visible now and were not before.
         present: ids of maps that the database had already, with the same content; they are left as they are.
+        retired: those of them that are retired here, by id with the reason.
         quarantined: active maps of the dataset that came in quarantine; with the ids of maps that placed them
             and are neither in the dataset nor in the database.
     """
 
     created: tuple[str, ...]
     present: tuple[str, ...]
+    retired: Mapping[str, str] = field(default_factory=dict)
     quarantined: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     version: int
     dry_run: bool
@@ -207,8 +213,9 @@ def import_dataset(
         dry_run: read and check everything, write nothing.
 
     Raises:
-        ExportError: the folder is no sound dataset, or the database has another map of the same id; nothing
-            has been committed. ConflictError, StoreError: the store failed; the import can be run again.
+        ExportError: the folder is no sound dataset, or the database has another map of the same id. Nothing
+            has been committed, or the message says what has.
+        ConflictError, StoreError: the store failed; the import can be run again.
     """
     rows, listed = open_dataset(folder)
     own = own_rows(folder, listed)
@@ -228,18 +235,24 @@ def import_dataset(
     present: list[str] = []
     for done, row in enumerate(_parents_first(rows)):
         map_id = row["map_id"]
-        new = map_id not in there or (map_id not in live and row["status"] != RETIRED)
-        (created if new else present).append(map_id)
+        same = map_id in there and there[map_id].content_digest == row["content_digest"]
+        new = map_id not in there or (map_id not in live and row["status"] != RETIRED and not same)
         if dry_run or new:
-            found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
+            try:
+                found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
+            except ExportError as error:
+                before = f"; imported before it: {', '.join(created)}" if created and not dry_run else ""
+                raise ExportError(f"{error}{before}") from error
             if not dry_run:
                 _commit(database, found, _vouched_reason(row, missing), map_id in missing, trusted)
+        (created if new else present).append(map_id)
         told(done + 1, len(rows))
     if trusted and not dry_run:
         _vouch_for(database, rows, missing)
     return Imported(
         created=tuple(created),
         present=tuple(present),
+        retired={m: there[m].status_reason for m in present if m not in live},
         quarantined={map_id: held[map_id] for map_id in created if map_id in held},
         version=database.poll_version(),
         dry_run=dry_run,

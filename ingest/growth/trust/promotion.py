@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +63,6 @@ def promote_confirmed(
         localiser: of the active maps of the newest snapshot.
         work: work folder: without anything new nothing is asked again.
         new: photos that may corroborate a map, beside the images of other maps.
-
-    Raises:
-        StoreError
     """
     snapshot = database.snapshot()
     asked = _question(snapshot, database, options, new)
@@ -127,22 +124,25 @@ def _question(snapshot: Snapshot, database: Database, options: GrowthOptions, ne
 
 
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
-    """Promote one map without confirmation; canaries are asked, and refuse it unless forced.
+    """Promote one map without confirmation, a retired one, too; canaries may refuse it unless forced.
 
     Args:
         map_id: or its first letters, if no other map begins so.
 
     Raises:
-        MapNotFoundError, StoreError: it is retired, or no active map holds it.
-        ConflictError: it was changed by someone else meanwhile.
+        MapNotFoundError, StoreError, ConflictError: no reason, no active map holds it, or it has changed.
     """
+    if not reason.strip():
+        raise StoreError(f"promote {map_id}: expected a reason, for those who will ask later, found none")
     snapshot = database.snapshot()
     map_id = snapshot.find(map_id, include_retired=True).map_id
     summary = snapshot.get(map_id)
     if summary.status == "active":
         return Promotion(map_id=map_id, promoted=True, reason="it was active already")
     if summary.status == "retired":
-        raise StoreError(f"map {map_id} is retired ({summary.status_reason}); commit it again")
+        again = replace(snapshot.load_map(map_id), status="quarantined")
+        database.commit_maps([again], reasons={map_id: f"retired before: {summary.status_reason}"})
+        return promote_by_hand(database, map_id, reason, force=force)
     gate = _tried(database, Localiser.open(database), [snapshot.load_map(map_id)]).gate
     if not gate.passes and not force:
         return _stays(map_id, gate)
