@@ -133,12 +133,11 @@ class SegmentFiles:
 
         Files that were used or written here stay.
         """
-        for content in self._read:
-            if hasattr(mmap, "MADV_DONTNEED"):
+        with suppress(OSError, AttributeError):  # not every system has these
+            for content in self._read:
                 content.madvise(mmap.MADV_DONTNEED)
+            ctypes.CDLL(None).malloc_trim(0)  # of glibc: what is free between what is used
         self._read.clear()
-        with suppress(OSError, AttributeError):  # of glibc: what is free between what is used
-            ctypes.CDLL(None).malloc_trim(0)
         self._prune()
 
     def _prune(self) -> None:
