@@ -203,7 +203,11 @@ def _largest_stream(container: InputContainer, name: str) -> VideoStream:
     streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
     if not streams:
         kinds = sorted({stream.type for stream in container.streams})
-        found = f"only {', '.join(kinds)}" if kinds else "no stream in it; its index is broken, copy it again"
+        found = (
+            f"only {', '.join(kinds)}"
+            if kinds
+            else "no stream in it; it has no frames, or its index is broken: copy it again"
+        )
         raise VideoError(f"{name}: expected a film, found {found}")
     # None without a decoder, whatever its type says.
     decodable = [stream for stream in streams if cast("Any", stream).codec_context is not None]

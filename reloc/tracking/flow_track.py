@@ -223,7 +223,8 @@ class FlowTrack:
         """The pose of the landmarks that were followed (None: all); what agrees with it stays."""
         options, followed = self._options, marks if good is None else marks.take(np.flatnonzero(good))
         if len(followed) < options.min_landmarks:
-            self.why = f"{len(followed)} of {len(marks)} landmarks are found again"
+            found = f"{len(followed)} of {len(marks)} landmarks are found again"
+            self.why = f"{found}, {options.min_landmarks} are needed"
             return None
         fitted = self._fitted(followed, predicted)
         agree = 0 if fitted is None else int(fitted.inlier.sum())
