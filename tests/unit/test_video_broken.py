@@ -82,7 +82,9 @@ def test_an_mp4_without_its_index(tmp_path: Path) -> None:
     assert "without its index" in _refused(path)
     at = data.index(b"moov")
     path.write_bytes(overwritten(data, at + 4, len(data) - at - 4))
-    assert "expected a film, found no stream in it; it has no frames, or its index is broken" in _refused(path)
+    assert "expected a film, found no stream in it; it has no frames, or its index is broken" in _refused(
+        path
+    )
 
 
 def test_sound_alone_and_a_cover_picture(tmp_path: Path) -> None:
