@@ -64,9 +64,18 @@ PYTHON_NOT_RUN = {
 # The page that makes the database; the others begin with what it leaves.
 _FIRST = "docs/quickstart.md"
 # What these show, others run part by part: placing by a scan test_anchor, test_anchor_near, test_picks_page;
-# by control points docs/control-points.md; films and tracks test_ingest_video and test_track_command; the
-# names in Python docs/python.md and test_python_api. Whole they are run with the studies.
-_AT_NIGHT = {"docs/tutorials/photogrammetrist.md", "docs/anchoring.md", "docs/video.md", "film-and-scan"}
+# by control points docs/control-points.md; films and tracks test_ingest_video and test_track_command; growth
+# and the gateway their own pages; the names in Python docs/python.md and test_python_api. Whole they are run
+# with the studies.
+_AT_NIGHT = {
+    "docs/anchoring.md",
+    "docs/video.md",
+    "docs/tutorials/ar-developer.md",
+    "docs/tutorials/community-host.md",
+    "docs/tutorials/photogrammetrist.md",
+    "film-and-scan",
+    "service",
+}
 _LANGUAGES = {"sh", "python", "sql", "json", "text"}
 
 _NOTEBOOK_FOLDER = ROOT / "docs" / "notebooks"

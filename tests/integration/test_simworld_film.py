@@ -26,6 +26,8 @@ from tools.worlds.film_world import (
     write_film,
 )
 
+pytestmark = pytest.mark.evaluation  # worlds of studies
+
 _WORLD = replace(WorldOptions.short(1), town_size_m=(180.0, 160.0))
 _OPTIONS = FilmOptions(
     world=_WORLD,
