@@ -126,7 +126,12 @@ def test_passes_over_many_pixels_are_refused_before_decoding(client: Client) -> 
 
 def test_memory_beyond_the_limit_is_not_given(database: Path, honest: bytes) -> None:
     options = ServeOptions(
-        listen=("tcp/127.0.0.1:0",), workers=1, query_memory_bytes=200 << 20, deadline_s=60
+        # Stacks and heaps of further threads take a hundred megabytes of addresses.
+        listen=("tcp/127.0.0.1:0",),
+        workers=1,
+        threads_per_worker=1,
+        query_memory_bytes=200 << 20,
+        deadline_s=60,
     )
     with start_server(Database.open(database), options) as server, Client(server.endpoints[0]) as client:
         error = refusal(client, progressive_jpeg(SIDE, 2))  # 240 MB of coefficients

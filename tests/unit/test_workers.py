@@ -18,7 +18,7 @@ from featuredb.store import Database
 from reloc.localiser import Localiser, OnDemand
 from reloc.service.handler import answer_query
 from reloc.service.workers import answering, process
-from reloc.service.workers.answering import WorkerLimits
+from reloc.service.workers.answering import WorkerLimits, _is_out_of_memory
 from reloc.service.workers.area_files import AreaFiles, MappedAreas
 from reloc.service.workers.process import WorkerFailedError, WorkerProcess
 from tests.support.field_queries import moved
@@ -117,3 +117,11 @@ def test_a_picture_without_memory_for_it_is_too_large(monkeypatch):
     with pytest.raises(ImageError) as error:
         decode.decode_gray(data, DecodeLimits())
     assert error.value.code == "too_large"
+
+
+@pytest.mark.parametrize(
+    ("error", "is_it"),
+    [(MemoryError(), True), (RuntimeError("can't start new thread"), True), (RuntimeError("else"), False)],
+)
+def test_what_a_lack_of_memory_looks_like(error: Exception, is_it: bool) -> None:
+    assert _is_out_of_memory(error) == is_it

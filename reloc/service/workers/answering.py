@@ -79,7 +79,7 @@ def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer)
             connection.send_bytes(answer)
         except (EOFError, OSError):
             return
-        except (MemoryError, cv2.error) as error:
+        except (MemoryError, RuntimeError, cv2.error) as error:
             if not _is_out_of_memory(error):
                 raise
             os._exit(OUT_OF_MEMORY)
@@ -126,6 +126,7 @@ def _answer(answerer: Answerer, ask: object, data: bytes, localiser: Localiser) 
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    return isinstance(error, MemoryError) or (
-        isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem
-    )
+    if isinstance(error, cv2.error):
+        return bool(error.code == cv2.Error.StsNoMem)
+    # A thread has no place for its stack.
+    return isinstance(error, MemoryError) or str(error) == "can't start new thread"
