@@ -227,6 +227,13 @@ def import_dataset(
     there = {m.map_id: m for m in snapshot.any_maps(include_retired=True)}
     live = {map_id: m for map_id, m in there.items() if m.status != RETIRED}
     _check_rows(folder, rows, {map_id: m.content_digest for map_id, m in live.items()})
+    stay = {
+        r["map_id"]
+        for r in rows
+        if r["map_id"] in there.keys() - live.keys()
+        and there[r["map_id"]].content_digest == r["content_digest"]
+    }
+    rows = [row | {"status": RETIRED} if row["map_id"] in stay else row for row in rows]
     missing = _missing_parents(
         rows, {map_id: m.parents if isinstance(m, MapSummary) else () for map_id, m in live.items()}
     )
@@ -235,8 +242,7 @@ def import_dataset(
     present: list[str] = []
     for done, row in enumerate(_parents_first(rows)):
         map_id = row["map_id"]
-        same = map_id in there and there[map_id].content_digest == row["content_digest"]
-        new = map_id not in there or (map_id not in live and row["status"] != RETIRED and not same)
+        new = map_id not in there or (map_id not in live and row["status"] != RETIRED)
         if dry_run or new:
             try:
                 found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
