@@ -204,7 +204,7 @@ def _left_open(
 
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
     or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
-    What is known of lenses beforehand does not: so many times more it weighs.
+    Priors of lenses are not residuals: they keep the widths that they state.
     """
     shared = design_effect(*residuals_of(block), longest_side(block.cameras))
     factor = max(float(structure.figures["neighbours_factor"]), shared)
