@@ -16,11 +16,11 @@ class ViewCones:
 
     Attributes:
         direction: (p, 3), mean unit vector from the point to the cameras that saw it.
-        spread_cos: (p,), cosine of the angle between that mean and the outermost view; 1 without any.
+        spread: (p,), radians between that mean and the outermost view; 0 without any.
     """
 
     direction: NDArray[np.floating]
-    spread_cos: NDArray[np.floating]
+    spread: NDArray[np.floating]
 
 
 def view_cones(
@@ -36,9 +36,9 @@ def view_cones(
     direction = np.zeros_like(points, dtype=np.float64)
     np.add.at(direction, point_of, unit)
     direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-    spread = np.ones(len(points))
-    np.minimum.at(spread, point_of, np.einsum("ij,ij->i", direction[point_of], unit))
-    return ViewCones(direction=direction, spread_cos=spread)
+    outermost = np.ones(len(points))
+    np.minimum.at(outermost, point_of, np.einsum("ij,ij->i", direction[point_of], unit))
+    return ViewCones(direction=direction, spread=np.arccos(np.clip(outermost, -1.0, 1.0)))
 
 
 def in_view(
@@ -61,5 +61,4 @@ def in_view(
     toward = cam_from_points.center - points
     toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
     angle = np.arccos(np.clip(np.einsum("ij,ij->i", toward, cones.direction), -1.0, 1.0))
-    cone = np.arccos(np.clip(cones.spread_cos, -1.0, 1.0)) + np.radians(beyond_deg)
-    return np.asarray(inside & (angle <= cone), dtype=np.bool_)
+    return np.asarray(inside & (angle <= cones.spread + np.radians(beyond_deg)), dtype=np.bool_)

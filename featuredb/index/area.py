@@ -19,11 +19,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.descriptor_index import DescriptorCodes
-from featuredb.index.segment import Segment, segment_of
+from featuredb.index.segment import Segment, full_roots, segment_of
 from featuredb.index.stacked import Moved, Stacked
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.move import full_covariances
 
 _LOG = logging.getLogger(__name__)
 
@@ -45,16 +44,15 @@ class Area:
     Attributes:
         frame: local ENU frame of everything here.
         maps: the maps without images, points and observations, which the
-            segments have (`FeatureMap.bare`); `point_map` and `image_map` index into it.
+            segments have (`FeatureMap.bare`); `map_of` and `image_map` index into it.
         segments: (m,) of the maps, whose arrays stay where they are, in mapped files for example.
         points, view_direction: those of the segments, row by row, in `frame`.
-        point_map: (p,) int32, ascending.
         point_start, image_start: (m + 1,) int64, rows where the points and images of each map begin.
         image_map: (i,) int32, ascending.
         image_sights: (i,) int64, of how many points each image has an observation, twice if it has two.
         covisible: (i, i) sparse, numbers of shared points; between maps, of neighbouring places.
         image_center, image_scene, image_reach: those of the segments, one after the other, in `frame`.
-        point_row, covariance, view_spread_cos, view_distance, descriptors, lists, code: those of the
+        point_row, covariance_root, view_spread, view_distance, descriptors, lists, code: those of the
             segments, row by row; covariances in the maps' own frames.
         lenses: by camera key the maps' cameras that have it: row of the map, camera, images that it took.
         extractor_fingerprint: of all descriptors.
@@ -66,13 +64,12 @@ class Area:
     maps: tuple[FeatureMap, ...]
     segments: tuple[Segment, ...]
     points: Moved
-    point_map: NDArray[np.int32]
     point_start: NDArray[np.int64]
     point_row: Stacked[np.int32]
-    covariance: Stacked[np.float32]
+    covariance_root: Stacked[np.float16]
     view_direction: Moved
-    view_spread_cos: Stacked[np.float32]
-    view_distance: Stacked[np.float32]
+    view_spread: Stacked[np.float16]
+    view_distance: Stacked[np.float16]
     descriptors: Stacked[np.uint8]
     lists: Stacked[np.int16]
     code: Stacked[np.uint8]
@@ -94,7 +91,11 @@ class Area:
 
     def searched_points(self) -> NDArray[np.int64]:
         """Rows of the points of the maps that are searched."""
-        return np.flatnonzero(self.searched[self.point_map])
+        return np.flatnonzero(np.repeat(self.searched, np.diff(self.point_start)))
+
+    def map_of(self, points: NDArray[np.integer]) -> NDArray[np.intp]:
+        """Rows of the maps that points (k,) belong to."""
+        return np.searchsorted(self.point_start, points, side="right") - 1
 
     def searched_images(self) -> NDArray[np.bool_]:
         """(i,) which images are of the maps that are searched."""
@@ -102,9 +103,8 @@ class Area:
 
     def point_covariance(self, rows: NDArray[np.integer]) -> FloatArray:
         """(k, 3, 3) of points (k,), square metres in `frame`, relative to the map's gauge."""
-        turn = self.points.turns[self.point_map[rows]]
-        own = full_covariances(self.covariance[rows])
-        return np.asarray(turn @ own @ np.swapaxes(turn, 1, 2), dtype=np.float64)
+        root = self.points.turns[self.map_of(rows)] @ full_roots(self.covariance_root[rows])
+        return np.asarray(root @ np.swapaxes(root, 1, 2), dtype=np.float64)
 
     def codes(self, rows: NDArray[np.integer] | None = None) -> DescriptorCodes:
         """Of the descriptors of these points (k,), or of all."""
@@ -130,7 +130,7 @@ class Area:
             rows: (k,) of points, ascending, without repetition. of_point: (k,).
         """
         sums = np.zeros(len(self.image_map))
-        for number in np.unique(self.point_map[rows]):
+        for number in np.unique(self.map_of(rows)):
             segment, start = self.segments[number], self.point_start[number : number + 2]
             mine = slice(*np.searchsorted(rows, start))
             own = np.zeros(len(segment))
@@ -146,7 +146,7 @@ class Area:
             rows: (k,) of points, ascending, without repetition.
         """
         pairs = [(np.zeros(0, np.intp), np.zeros(0, np.intp))]
-        for number in np.unique(self.point_map[rows]):
+        for number in np.unique(self.map_of(rows)):
             segment = self.segments[number]
             seen = segment.see_point + self.point_start[number]
             position = np.minimum(np.searchsorted(rows, seen), len(rows) - 1)
@@ -225,18 +225,16 @@ def join_segments(
     scene = np.concatenate([move.act(s.image_scene) for move, s in parts])
     reach = np.concatenate([s.image_reach for s in segments])
     image_map = np.repeat(np.arange(len(maps), dtype=np.int32), images)
-    point_map = np.repeat(np.arange(len(maps), dtype=np.int32), points)
     return Area(
         frame=frame,
         maps=tuple(maps),
         segments=tuple(segments),
         points=Moved(segments, "points", turns, shifts),
-        point_map=point_map,
         point_start=np.cumsum([0, *points]),
         point_row=Stacked(segments, "point_row"),
-        covariance=Stacked(segments, "covariance"),
+        covariance_root=Stacked(segments, "covariance_root"),
         view_direction=Moved(segments, "view_direction", turns),
-        view_spread_cos=Stacked(segments, "view_spread_cos"),
+        view_spread=Stacked(segments, "view_spread"),
         view_distance=Stacked(segments, "view_distance"),
         descriptors=Stacked(segments, "descriptors"),
         lists=Stacked(segments, "lists"),

@@ -14,6 +14,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.view_cones import view_cones
 from featuredb.index.descriptor_index import DescriptorCodes
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.move import full_covariances
+
+_LOWER = np.tril_indices(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
@@ -24,10 +27,10 @@ class Segment:
         origin: (1, 3) float64, in the middle of the points.
         points: (p, 3) float32, from there; of a map 10 km wide they are rounded by half a millimetre.
         point_row: (p,) int32, row in the map's MapPoints, ascending.
-        covariance: (p, 6) float32, as in MapPoints.
+        covariance_root: (p, 6) float16, metres: lower triangles L of covariances L @ L.T, row by row.
         view_direction: (p, 3) float16, mean unit vector from the point to the cameras that saw it.
-        view_spread_cos: (p,) float32, cosine of the angle between that mean and the outermost view.
-        view_distance: (p,) float32, between the nearest and the farthest of those cameras, in the middle.
+        view_spread: (p,) float16, radians between that mean and the outermost view.
+        view_distance: (p,) float16, between the nearest and the farthest of those cameras, in the middle.
         descriptors: (p, 128) uint8, mean RootSIFT of the track, length 512.
         lists, codes: (p,) int16 and (p, 16) uint8, of the descriptors (DescriptorCodes).
         image_id, image_camera: (i,) int32, as in MapImage.
@@ -45,10 +48,10 @@ class Segment:
     origin: FloatArray
     points: NDArray[np.float32]
     point_row: NDArray[np.int32]
-    covariance: NDArray[np.float32]
+    covariance_root: NDArray[np.float16]
     view_direction: NDArray[np.float16]
-    view_spread_cos: NDArray[np.float32]
-    view_distance: NDArray[np.float32]
+    view_spread: NDArray[np.float16]
+    view_distance: NDArray[np.float16]
     descriptors: NDArray[np.uint8]
     lists: NDArray[np.int16]
     codes: NDArray[np.uint8]
@@ -67,6 +70,13 @@ class Segment:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+def full_roots(lower: NDArray[np.float16]) -> FloatArray:
+    """(n, 3, 3) lower triangles of Segment.covariance_root (n, 6)."""
+    full = np.zeros((len(lower), 3, 3))
+    full[:, _LOWER[0], _LOWER[1]] = lower
+    return full
 
 
 def segment_of(feature_map: FeatureMap) -> Segment:
@@ -101,10 +111,10 @@ def segment_of(feature_map: FeatureMap) -> Segment:
         origin=origin,
         points=(points - origin).astype(np.float32),
         point_row=rows.astype(np.int32),
-        covariance=feature_map.points.covariance[rows],
+        covariance_root=_halved(_roots(feature_map.points.covariance[rows])),
         view_direction=cones.direction.astype(np.float16),
-        view_spread_cos=cones.spread_cos.astype(np.float32),
-        view_distance=(0.5 * (near + far)).astype(np.float32),
+        view_spread=cones.spread.astype(np.float16),
+        view_distance=_halved(0.5 * (near + far)),
         descriptors=descriptors,
         lists=codes.lists,
         codes=codes.codes,
@@ -123,6 +133,25 @@ def segment_of(feature_map: FeatureMap) -> Segment:
         shared_image=shared.indices.astype(np.int32),
         shared_count=shared.data.astype(np.int32),
     )
+
+
+def _roots(upper: NDArray[np.float32]) -> FloatArray:
+    """(n, 6) lower triangles of MapPoints.covariance (n, 6), which may have no extent in some direction.
+
+    One that is no number says nothing: it is as wide as half precision can say.
+    """
+    known = np.isfinite(upper).all(axis=1)[:, None]
+    unknown = 1e10 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0], np.float32)
+    values, axes = np.linalg.eigh(full_covariances(np.where(known, upper, unknown)))
+    root = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    lower = np.swapaxes(np.linalg.qr(np.swapaxes(root, 1, 2), mode="r"), 1, 2)
+    return np.asarray(lower[:, _LOWER[0], _LOWER[1]])
+
+
+def _halved(metres: FloatArray) -> NDArray[np.float16]:
+    """In half precision; what is larger than that holds becomes the largest it holds, 65 km."""
+    most = float(np.finfo(np.float16).max)
+    return np.clip(metres, -most, most).astype(np.float16)
 
 
 def _shared(

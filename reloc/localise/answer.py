@@ -36,7 +36,7 @@ def make_answer(
         lent: of a lens that the map has lent: how uncertain pose and lens are together, within what is known
             of it.
     """
-    counts = np.bincount(area.point_map[point_rows], minlength=len(area.maps))
+    counts = np.bincount(area.map_of(point_rows), minlength=len(area.maps))
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
     main = area.maps[order[0]]
     center = pose.cam_from_local.center
@@ -162,12 +162,12 @@ def _inliers(area: Area, order: list[int], pixels: FloatArray, point_rows: NDArr
     place[order] = np.arange(len(order), dtype=np.int32)
     utm = np.empty((len(point_rows), 3))
     for i in order:
-        mine = area.point_map[point_rows] == i
+        mine = area.map_of(point_rows) == i
         utm[mine] = area.frame.utm_from_enu(area.points[point_rows[mine]], area.maps[i].epsg)
     return InlierPoints(
         pixels=tuple(map(tuple, np.round(pixels, 2).tolist())),
         utm=tuple(map(tuple, np.round(utm, 4).tolist())),
-        map_rows=tuple(place[area.point_map[point_rows]].tolist()),
+        map_rows=tuple(place[area.map_of(point_rows)].tolist()),
     )
 
 
@@ -181,7 +181,7 @@ def shape_covariance(
     Args:
         main: row of the map. rows: (k,) of the area's points that gave the pose.
     """
-    mine = rows[area.point_map[rows] == main]
+    mine = rows[area.map_of(rows) == main]
     moved = _moved_points(area, main, mine, modes)
     if moved is None:
         return None

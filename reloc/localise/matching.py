@@ -50,7 +50,7 @@ class ClusterMatcher:
         self.cluster = cluster
         self._features, self._options = features, options
         area = cluster.area
-        of_map = area.point_map[cluster.points]
+        of_map = area.map_of(cluster.points)
         self._maps = [
             _MapNeighbours(features, area, cluster.points[of_map == row].astype(np.int64))
             for row in np.unique(of_map)
@@ -141,7 +141,7 @@ def visible_points(
     A point counts as seen from a known side when the ray to the new camera lies within the cone of the
     map's own views, widened by `beyond_views_deg`.
     """
-    cones = ViewCones(direction=area.view_direction[points], spread_cos=area.view_spread_cos[points])
+    cones = ViewCones(direction=area.view_direction[points], spread=area.view_spread[points])
     seen = in_view(area.points[points], cones, camera, cam_from_local, beyond_views_deg)
     return np.asarray(points[seen], dtype=np.int64)
 

@@ -60,7 +60,7 @@ class PoseCandidate:
     def main_map(self) -> FeatureMap:
         """The map with most inliers."""
         rows = self.rows if len(self.rows) else slice(None)
-        return self.area.maps[int(np.bincount(self.area.point_map[self.matches.point[rows]]).argmax())]
+        return self.area.maps[int(np.bincount(self.area.map_of(self.matches.point[rows])).argmax())]
 
 
 def search(
@@ -261,7 +261,7 @@ def _with_lens_prior(
     """
     if not request.camera_is_exact:
         return replace(pose, lens_prior=request.camera_prior or pose.lens_prior)
-    counts = np.bincount(area.point_map[matches.point[pose.inliers]], minlength=len(area.maps))
+    counts = np.bincount(area.map_of(matches.point[pose.inliers]), minlength=len(area.maps))
     uncertainty = LensUncertainty.of_provenance(area.maps[int(np.argmax(counts))].provenance)
     if uncertainty is None:
         return pose

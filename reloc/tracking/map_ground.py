@@ -81,7 +81,7 @@ class MapGround:
         area = self.area
         if self.own is not None:
             return OwnPose(map_id=area.maps[0].map_id, frame=self.own, cam_from_map=pose, covariance=measured)
-        main = area.maps[int(np.argmax(np.bincount(area.point_map[rows], minlength=len(area.maps))))]
+        main = area.maps[int(np.argmax(np.bincount(area.map_of(rows), minlength=len(area.maps))))]
         return EarthPose(
             **place_on_earth(area.frame, pose, main.epsg),
             height_datum=main.height_datum,

@@ -124,7 +124,7 @@ def test_naming_maps_of_an_area_builds_nothing_and_leaves_the_others_out(
     (one,) = localiser.areas_of(("field",))
     assert both.area.camera_for_key("its own") is not None
     assert one.area.camera_for_key("its own") is None
-    assert set(one.area.point_map[one.area.searched_points()]) == {0}
+    assert set(one.area.map_of(one.area.searched_points())) == {0}
 
 
 def test_a_map_in_quarantine_that_positions_placed_answers_where_it_is_named(

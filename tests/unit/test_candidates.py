@@ -106,7 +106,7 @@ def test_a_prior_keeps_only_the_images_near_it() -> None:
     area = indexed(place(0, map_id="a"), place(1, east_m=1200.0, map_id="b"))
     (cluster,) = find_clusters([area], photo_of(0), prior_at(area, 1200.0, 10.0), CandidateOptions())
     assert (area.area.image_map[cluster.images] == 1).all()
-    assert (area.area.point_map[cluster.points] == 1).all()
+    assert (area.area.map_of(cluster.points) == 1).all()
     assert len(cluster.images) == 8
     # Beyond a prior that was tried in vain is all the rest.
     (other,) = find_clusters([area], photo_of(0), None, CandidateOptions(), prior_at(area, 1200.0, 10.0))

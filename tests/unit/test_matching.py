@@ -102,7 +102,7 @@ def test_a_second_map_of_the_place_does_not_disturb_the_first() -> None:
     alone = match_cluster(features, whole(indexed(first)), OPTIONS)
     area = indexed(first, second)
     both = match_cluster(features, whole(area), OPTIONS)
-    of_first = area.area.point_map[both.point] == 0
+    of_first = area.area.map_of(both.point) == 0
     np.testing.assert_array_equal(np.sort(both.feature[of_first]), np.sort(alone.feature))
     assert (~of_first).sum() == len(alone)
 
@@ -185,7 +185,7 @@ def test_visible_points_against_a_loop() -> None:
             toward = pose.center - area.points[np.array(row)]
             toward /= np.linalg.norm(toward)
             off_deg = np.degrees(np.arccos(np.clip(toward @ area.view_direction[np.array([row])][0], -1, 1)))
-            cone_deg = np.degrees(np.arccos(np.clip(area.view_spread_cos[np.array(row)], -1, 1))) + 30.0
+            cone_deg = np.degrees(float(area.view_spread[np.array(row)])) + 30.0
             assert (row in found) == bool(inside[row] and off_deg <= cone_deg)
     # The two cameras of the map look from the east: from the west nothing is known, nor from below.
     assert len(visible_points(area, rows, CAMERA, ring(6)[0])) > 100

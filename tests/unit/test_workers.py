@@ -83,7 +83,7 @@ def test_what_did_not_change_over_reloads_keeps_its_file_and_its_mapping(tmp_pat
         for own, theirs in zip(localiser.areas, mapped[-1].areas, strict=True):
             assert (own.first, len(own.index)) == (theirs.first, len(theirs.index))
             assert [m.map_id for m in own.area.maps] == [m.map_id for m in theirs.area.maps]
-            for name in ("point_map", "image_sights", "image_center"):
+            for name in ("point_start", "image_sights", "image_center"):
                 np.testing.assert_array_equal(getattr(own.area, name), getattr(theirs.area, name))
             for name in ("points", "view_direction", "descriptors", "lists", "point_row"):
                 np.testing.assert_array_equal(

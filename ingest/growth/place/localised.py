@@ -126,7 +126,7 @@ def _densified(features: Features, outcome: Localised) -> LocalisedPhoto:
         if len(feature) >= outcome.best.evidence.inliers:
             pose, spread = better, area.point_covariance(point)
             uncertainty = pose_uncertainty(pixels, points, spread, better, QUERY.pose)
-    used, map_of = np.unique(area.point_map[point], return_inverse=True)
+    used, map_of = np.unique(area.map_of(point), return_inverse=True)
     return LocalisedPhoto(
         frame=area.frame,
         cam_from_local=pose.cam_from_local,
@@ -153,8 +153,8 @@ def _match_each_map(
     """
     visible = visible_points(area, area.searched_points(), pose.camera, pose.cam_from_local, POSSIBLE_DEG)
     found = np.zeros((2, 0), dtype=np.int64)
-    for map_row in np.unique(area.point_map[visible]):
-        points = visible[area.point_map[visible] == map_row].astype(np.int32)
+    for map_row in np.unique(area.map_of(visible)):
+        points = visible[area.map_of(visible) == map_row].astype(np.int32)
         matches = guided_matches(features, area, points, pose.camera, pose.cam_from_local, QUERY.matching)
         pixels, places = pairs(features, area, matches)
         errors = reprojection_errors(pixels, places, pose.camera, pose.cam_from_local)
