@@ -10,7 +10,7 @@ from pathlib import Path
 
 from featuredb.atomic import atomic_file
 from featuredb.errors import CandidateNotFoundError, FeatureDbError
-from featuredb.store import Database
+from featuredb.store import Database, Snapshot
 from featuredb.store.candidates.photos import list_candidates, load_images, refuse
 from featuredb.store.candidates.states import Candidate
 from ingest.executor import Executor, Progress, no_progress, open_executor
@@ -38,7 +38,7 @@ def waiting_photos(
 
     Returns:
         Usable ones, oldest first, the stem of each name its candidate's id; reason code and sentence of the
-        others, by candidate id: broken files, copies of others.
+        others, by candidate id: broken files, copies of others or of photos of active maps.
 
     Raises:
         StoreError: the database cannot be read.
@@ -57,17 +57,28 @@ def waiting_photos(
         return [], {}
     scanned = scan_folder(folder, ScanOptions(), progress, work / "scan" / f"{_FOLDER}.json")
     by_name = {photo.name: photo for photo in scanned.photos if photo.name in waiting}
+    copies = _copies(database.snapshot(), {photo.sha256 for photo in by_name.values()})
     photos: list[Photo] = []
     unusable: dict[str, tuple[str, str]] = {}
     for name, candidate in waiting.items():
         photo = by_name.get(name)
         if photo is None:  # withdrawn meanwhile
             continue
-        if photo.status == "ok" or (photo.duplicate_of and photo.duplicate_of not in by_name):
+        if photo.sha256 in copies:
+            reason = f"map {copies[photo.sha256]} was made from the same file; growth needs other photos"
+            unusable[candidate.candidate_id] = ("DUPLICATE", reason)
+        elif photo.status == "ok" or (photo.duplicate_of and photo.duplicate_of not in by_name):
             photos.append(_with_query(photo, candidate))
         else:
             unusable[candidate.candidate_id] = (photo.reason_code.upper(), photo.reason)
     return photos, unusable
+
+
+def _copies(snapshot: Snapshot, digests: set[str]) -> dict[str, str]:
+    """Of photos, by SHA-256, the active map that has the same file and did not grow out of contributions."""
+    active = {m.map_id for m in snapshot.maps() if m.status == "active" and m.source != "growth"}
+    having = snapshot.maps_of_photos(digests)
+    return {digest: map_id for map_id in sorted(active & having.keys()) for digest in having[map_id]}
 
 
 def _write_file(database: Database, target: Path, candidate_id: str) -> None:

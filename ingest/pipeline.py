@@ -149,6 +149,7 @@ def ingest_photos(
             *scanned.notes,
             *_warnings(result, outcomes, options),
             *_quarantine_note(quarantined),
+            *_twice(database, outcomes, {photo.sha256 for photo in photos}),
             *(f"Matching of {o.task} is lost: {o.reason}" for o in result.matched.lost[:_MOST_NOTES]),
         ),
     )
@@ -296,6 +297,25 @@ def _quarantine_note(quarantined: Mapping[str, str]) -> tuple[str, ...]:
             f"Maps in quarantine ({len(ids)}: {', '.join(ids[:3])}{', ...' if len(ids) > 3 else ''}): "
             f"{reason}. They answer only queries that name them, until something better confirms them: {way}."
         )
+    return tuple(notes[:_MOST_NOTES])
+
+
+def _twice(database: Database, outcomes: Sequence[MapOutcome], photos: set[str]) -> tuple[str, ...]:
+    """Which other active maps have the same photos as active maps that were made now."""
+    made = {o.map_id for o in outcomes if o.status == "committed"}
+    if not made:
+        return ()
+    there = database.snapshot()
+    having = there.maps_of_photos(photos)
+    active = {m.map_id for m in there.maps() if m.status == "active"} & having.keys()
+    notes = []
+    for old in sorted(active - made):
+        for new in sorted(active & made):
+            if both := having[old] & having[new]:
+                notes.append(
+                    f"{len(both)} of the {len(having[new])} photos of map {new} are in active map {old}, "
+                    f"too, and both answer. To keep one: featuredb retire {database.url} {old} --reason TEXT"
+                )
     return tuple(notes[:_MOST_NOTES])
 
 

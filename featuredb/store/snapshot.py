@@ -138,6 +138,17 @@ class Snapshot:
             if m.map_id in rows and rows[m.map_id]["content_digest"] == content_digest(m)
         }
 
+    def maps_of_photos(self, digests: Collection[str]) -> dict[str, set[str]]:
+        """SHA-256 of those of some photos that maps have, by map; without retired maps."""
+        alive = {row["write_id"]: map_id for map_id, row in self._rows.items() if row["status"] != RETIRED}
+        where: Condition = ("sha256", "in", sorted(digests))
+        found: dict[str, set[str]] = {}
+        for batch in self._read(IMAGES, where, "the maps'", ["write_id", "sha256"]) if digests else ():
+            for row in batch.to_pylist():
+                if row["write_id"] in alive:
+                    found.setdefault(alive[row["write_id"]], set()).add(row["sha256"])
+        return found
+
     def maps(self, *, include_retired: bool = False) -> list[MapSummary]:
         """Those of `any_maps` with a place."""
         return [_summary(row) for row in self._oldest_first(include_retired) if has_place(row)]

@@ -236,7 +236,7 @@ def test_a_power_cut_leaves_what_was_seen(
 
 
 def test_photos_of_elsewhere_wait_broken_ones_and_copies_are_refused(
-    database: Database, shots: list[Shot]
+    anchored: Path, database: Database, shots: list[Shot]
 ) -> None:
     rng = np.random.default_rng(3)
     noise = rng.integers(0, 255, (480, 640), dtype=np.uint8)
@@ -245,8 +245,13 @@ def test_photos_of_elsewhere_wait_broken_ones_and_copies_are_refused(
         Shot(data=shots[0].data + b"\0", cam_from_local=shots[0].cam_from_local, owner="eve"),
     )
     nowhere = Shot(data=_jpeg(noise), cam_from_local=good.cam_from_local, owner="eve")
+    ours = Shot(
+        data=(anchored.parent / "survey" / "survey_0_4.jpg").read_bytes(),
+        cam_from_local=good.cam_from_local,
+        owner="eve",
+    )
     broken = Shot(data=good.data[:5000], cam_from_local=good.cam_from_local, owner="eve")
-    ids = give(database, [good, copy, nowhere, broken])
+    ids = give(database, [good, copy, nowhere, broken, ours])
     report = grow_candidates(database, growing())
     fates = {p.name: (p.outcome, p.reason_code) for p in report.photos}
     assert fates[ids[0]] == ("waiting", "ALONE")  # a single localised photo is never enough
@@ -254,6 +259,7 @@ def test_photos_of_elsewhere_wait_broken_ones_and_copies_are_refused(
     assert fates[ids[2]][1] in ("TOO_FEW_MATCHES", "TOO_FEW_INLIERS")
     assert fates[ids[1]][0] == "refused"
     assert fates[ids[3]][0] == "refused"
+    assert fates[ids[4]] == ("refused", "DUPLICATE")  # the map was made from the same file
     assert states(database)[ids[0]] == "waiting"
     later = grow_candidates(database, growing(give_up_days=30), now=NOW + timedelta(days=31))
     assert {p.reason_code for p in later.photos} == {"GAVE_UP"}

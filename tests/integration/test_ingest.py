@@ -135,6 +135,20 @@ def test_a_wrong_position_is_named_and_left_out(work: Path, tmp_path: Path) -> N
     assert report.maps[0].place.horizontal_m == pytest.approx(2.45 * 0.02, rel=0.3)
 
 
+def test_photos_that_another_map_has_are_told(
+    hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path: Path
+) -> None:
+    database = Database.create(tmp_path / "db")
+    first = ingest_photos(database, hills[0], replace(_TRUTH, work=work))
+    otherwise = replace(_TRUTH, work=work, gps_sigma_m=(0.03, 0.03))
+    second = ingest_photos(database, hills[0], otherwise)
+    old, new = (report.maps[0].map_id for report in (first, second))
+    assert old != new
+    assert not any("both answer" in w for w in first.warnings)
+    assert f"9 of the 9 photos of map {new} are in active map {old}, too" in second.warnings[0]
+    assert not any("both answer" in w for w in ingest_photos(database, hills[0], otherwise).warnings)
+
+
 def test_positions_that_agree_on_another_place_keep_their_photos_out(work: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     write_hill_photos(folder, gps_noise_m=0.01)
