@@ -56,7 +56,6 @@ class Area:
             segments, row by row; covariances in the maps' own frames.
         lenses: by camera key the maps' cameras that have it: row of the map, camera, images that it took.
         extractor_fingerprint: of all descriptors.
-        modes: (m,) joint errors of each map, None of those that keep none.
         searched: (m,) which maps take part in a search; the others are there as if they were not.
     """
 
@@ -82,7 +81,6 @@ class Area:
     covisible: sparse.csr_array
     lenses: Mapping[str, Sequence[tuple[int, Camera, int]]]
     extractor_fingerprint: str
-    modes: tuple[ErrorModes | None, ...]
     searched: NDArray[np.bool_]
 
     def only(self, map_ids: Collection[str]) -> "Area":
@@ -168,6 +166,18 @@ class Area:
             covariance=None if np.isnan(covariance).any() else covariance,
         )
 
+    def modes_of(self, number: int) -> ErrorModes | None:
+        """Joint errors of a map; None where it keeps none.
+
+        None, too, where they are broken: answers then rest on the covariances of single images.
+        """
+        feature_map = self.maps[number]
+        try:
+            return ErrorModes.of_provenance(feature_map.provenance, len(feature_map.cameras))
+        except InvalidValueError as error:
+            _LOG.warning("map %s: %s", feature_map.map_id, error)
+            return None
+
     def camera_for_key(self, camera_key: str) -> Camera | None:
         """Intrinsics that the maps have for this EXIF key; of the one that took most images if several.
 
@@ -248,7 +258,6 @@ def join_segments(
         covisible=_covisibility(segments, images, image_map, scene, reach),
         lenses=_lenses(maps, segments),
         extractor_fingerprint=fingerprints[0],
-        modes=tuple(_modes(feature_map) for feature_map in maps),
         searched=np.ones(len(maps), dtype=np.bool_),
     )
 
@@ -263,15 +272,6 @@ def _lenses(
             if key:
                 lenses.setdefault(key, []).append((row, camera, int(images)))
     return lenses
-
-
-def _modes(feature_map: FeatureMap) -> ErrorModes | None:
-    """None, too, where they are broken: answers then rest on the covariances of single images."""
-    try:
-        return ErrorModes.of_provenance(feature_map.provenance, len(feature_map.cameras))
-    except InvalidValueError as error:
-        _LOG.warning("map %s: %s", feature_map.map_id, error)
-        return None
 
 
 def _raised(parts: Sequence[NDArray[np.int32]], counts: NDArray[np.int64]) -> NDArray[np.int32]:

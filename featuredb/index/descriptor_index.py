@@ -28,7 +28,7 @@ _FEW = 25_000
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
 _LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
 LISTS = 2048
-_AT_ONCE = 256  # descriptors that are compared with all lists: they make eight megabytes
+_AT_ONCE = 64  # descriptors that are compared with all lists: they make two megabytes
 _CHUNK = 2_048  # descriptors at a time: bounds the copies
 
 

@@ -140,7 +140,7 @@ def _roots(upper: NDArray[np.float32]) -> FloatArray:
 
     One that is no number says nothing: it is as wide as half precision can say.
     """
-    known = np.isfinite(upper).all(axis=1)[:, None]
+    known = np.isfinite(upper).all(axis=1, keepdims=True)
     unknown = 1e10 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0], np.float32)
     values, axes = np.linalg.eigh(full_covariances(np.where(known, upper, unknown)))
     root = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]

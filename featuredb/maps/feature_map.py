@@ -23,6 +23,7 @@ from featuredb.geometry.arrays import FloatArray, freeze, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.lineage import GROWTH
 from featuredb.maps.statuses import MAP_METHODS as MAP_METHODS
 from featuredb.maps.statuses import MAP_STATUSES as MAP_STATUSES
 from featuredb.maps.statuses import MapMethod as MapMethod
@@ -325,9 +326,16 @@ class FeatureMap(MapParts):
         return (frame or self.frame).enu_from_utm(self.points.utm, self.epsg)
 
     def bare(self) -> "FeatureMap":
-        """The map without its images, points and observations: what is left is small."""
+        """The map without its images, points and observations: what is left is small.
+
+        Of the evidence for its placement, what growth has written is kept: maps beside it need that.
+        """
         none = self.points.take(np.zeros(0, np.int64))
-        return replace(self, images=(), points=none, observations=self.observations.none())
+        grown = {key: value for key, value in self.placement.evidence.items() if key == GROWTH}
+        placement = replace(self.placement, evidence=grown)
+        return replace(
+            self, images=(), points=none, observations=self.observations.none(), placement=placement
+        )
 
 
 def _covariance(name: str, value: ArrayLike, size: int) -> FloatArray:

@@ -258,7 +258,7 @@ class Snapshot:
         bare = {**row, "images": 0, "points": 0, "observations": 0}
         loaded = decode_map(bare, dict.fromkeys(CHILD_TABLES, ()))
         assert isinstance(loaded, FeatureMap)
-        return loaded
+        return loaded.bare()
 
     def images_of(self, map_ids: Collection[str]) -> dict[str, tuple[MapImage, ...]]:
         """Images of maps, by map, in their order.

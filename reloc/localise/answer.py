@@ -40,7 +40,7 @@ def make_answer(
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
     main = area.maps[order[0]]
     center = pose.cam_from_local.center
-    modes = area.modes[order[0]]
+    modes = area.modes_of(order[0])
     shape = None if modes is None else shape_covariance(area, order[0], pose, point_rows, modes)
     joint = on_earth(area, main, center, uncertainty.joint, point_rows, shape)
     covariance = joint[:6, :6]

@@ -120,15 +120,15 @@ def find_clusters(
             allowed &= ~images_in_reach(indexed.area, beyond, options)
         if allowed.any():
             reach.append(_Reach.of(indexed, allowed))
-    if sum(len(r.points) for r in reach) <= most and len(reach) <= options.max_clusters:
+    if sum(map(len, reach)) <= most and len(reach) <= options.max_clusters:
         return [Cluster(area=r.area, images=r.images, points=r.points, score=np.inf) for r in reach]
-    small = [len(r.points) <= most for r in reach]
+    small = [len(r) <= most for r in reach]
     votes = _vote(reach, features, options)
-    share = sum(float(given.sum()) for _, given in votes) / max(sum(len(r.points) for r in reach), 1)
+    share = sum(float(given.sum()) for _, given in votes) / max(sum(map(len, reach)), 1)
     found: list[Cluster] = []
     for i, r in enumerate(reach):
         if small[i]:
-            score = float(_above_chance(votes[i][1].sum(), share * len(r.points)))
+            score = float(_above_chance(votes[i][1].sum(), share * len(r)))
             found.append(Cluster(area=r.area, images=r.images, points=r.points, score=score))
         else:
             found.extend(_grow_clusters(r.area, _image_scores(r, votes[i], share), options))
@@ -138,11 +138,24 @@ def find_clusters(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Reach:
-    """The part of an area that is searched: rows (i,) of its images, and (p,) of the points that they see."""
+    """The part of an area that is searched.
+
+    Attributes:
+        images: (i,) rows of its images.
+        some: (p,) rows of the points that they see; None: all, which need no list.
+    """
 
     indexed: IndexedArea
     images: NDArray[np.intp]
-    points: NDArray[np.int32]
+    some: NDArray[np.int32] | None
+
+    def __len__(self) -> int:
+        return len(self.area.points) if self.some is None else len(self.some)
+
+    @property
+    def points(self) -> NDArray[np.int32]:
+        """Rows of the points in reach."""
+        return np.arange(len(self), dtype=np.int32) if self.some is None else self.some
 
     @property
     def area(self) -> Area:
@@ -150,19 +163,16 @@ class _Reach:
 
     def has(self, points: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(k,) which of the area's points (k,) are in reach."""
-        if len(self.points) == len(self.area.points):
+        if self.some is None:
             return np.ones(len(points), dtype=np.bool_)
-        place = np.minimum(np.searchsorted(self.points, points), max(len(self.points) - 1, 0))
-        return np.asarray(self.points[place] == points, dtype=np.bool_)
+        place = np.minimum(np.searchsorted(self.some, points), max(len(self) - 1, 0))
+        return np.asarray(self.some[place] == points, dtype=np.bool_)
 
     @classmethod
     def of(cls, indexed: IndexedArea, allowed: NDArray[np.bool_]) -> "_Reach":
         images = np.flatnonzero(allowed)
-        if len(images) == len(allowed):
-            points = np.arange(len(indexed.area.points), dtype=np.int32)
-        else:
-            points = indexed.area.points_of_images(images)
-        return cls(indexed=indexed, images=images, points=points)
+        some = None if len(images) == len(allowed) else indexed.area.points_of_images(images)
+        return cls(indexed=indexed, images=images, some=some)
 
 
 def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOptions) -> NDArray[np.bool_]:
@@ -224,7 +234,7 @@ def _nearest(reach: Sequence[_Reach], asked: NDArray[np.uint8], k: int) -> _Neig
     """
     groups: dict[int, list[int]] = {}
     for i, r in enumerate(reach):
-        if len(r.points):
+        if len(r):
             groups.setdefault(id(r.indexed.index), []).append(i)
     if not groups:
         none = np.zeros((len(asked), 0), np.int64)
@@ -239,7 +249,7 @@ def _nearest_of(
 ) -> _Neighbours:
     """As `_nearest`, for the areas (g,) that share an index and have points in reach."""
     index = reach[group[0]].indexed.index
-    in_reach = sum(len(reach[i].points) for i in group)
+    in_reach = sum(len(reach[i]) for i in group)
     shared = in_reach >= _MOST * len(index)
     if shared:
         first = np.array([reach[i].indexed.first for i in group])
@@ -252,7 +262,7 @@ def _nearest_of(
     place = order[np.maximum(np.searchsorted(first[order], proposed, side="right") - 1, 0)]
     row, squared = np.full(proposed.shape, -1, np.int64), np.full(proposed.shape, np.inf)
     # A shared index has areas, too, of which nothing is in reach: their rows are none of the one before.
-    length = np.array([len(reach[i].area.points if shared else reach[i].points) for i in group])
+    length = np.array([len(reach[i].area.points if shared else reach[i]) for i in group])
     own = proposed - first[place]
     asker, rank = np.nonzero((proposed >= 0) & (own >= 0) & (own < length[place]))
     by_area = np.argsort(place[asker, rank], kind="stable")

@@ -152,7 +152,7 @@ def test_a_part_of_a_map_keeps_its_part_of_them() -> None:
     assert part.cameras == (_LENS,)
     np.testing.assert_allclose(kept.poses, modes.poses[[1, 3]], rtol=1e-6)
     np.testing.assert_allclose(kept.lenses, modes.lenses[1:], rtol=1e-6)
-    assert build_area([part]).modes[0] is not None
+    assert build_area([part]).modes_of(0) is not None
 
 
 @pytest.mark.parametrize("lenses", [0, 3])
@@ -160,8 +160,8 @@ def test_broken_ones_are_left_out_and_said(lenses: int, caplog: pytest.LogCaptur
     rng = np.random.default_rng(2)
     whole = scene_map(points=box_points(rng, 40), descriptors=random_descriptors(rng, 40), poses=ring(4))
     wrong = ErrorModes(image_id=np.arange(4), poses=np.ones((4, 6, 1)), lenses=np.ones((lenses, 8, 1)))
-    assert build_area([replace(whole, provenance=wrong.as_provenance())]).modes == (None,)
+    assert build_area([replace(whole, provenance=wrong.as_provenance())]).modes_of(0) is None
     assert "1 cameras" in caplog.text
     caplog.clear()
-    assert build_area([replace(whole, provenance={"error_modes": 7})]).modes == (None,)
+    assert build_area([replace(whole, provenance={"error_modes": 7})]).modes_of(0) is None
     assert "expected image_id" in caplog.text
