@@ -231,8 +231,8 @@ def test_the_nearest_points_in_reach_against_all_of_them(seed: int) -> None:
             continue
         count = len(one.area.points)
         some = np.sort(rng.choice(count, int(rng.integers(0, count + 1)), replace=False))
-        points = np.arange(count) if rng.random() < 0.5 else some
-        reach.append(_Reach(indexed=one, images=np.arange(1), points=points.astype(np.int32)))
+        points = None if rng.random() < 0.5 else some.astype(np.int32)
+        reach.append(_Reach(indexed=one, images=np.arange(1), some=points))
     reach = [reach[i] for i in rng.permutation(len(reach))]
     part, row, squared = _nearest(reach, asked, 5)
     found, true_nearest = [], []
