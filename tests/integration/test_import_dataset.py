@@ -216,16 +216,30 @@ def test_what_is_retired_here_stays_so(
 def test_maps_that_came_before_a_broken_one_are_named(folder: Path, target: Database) -> None:
     path = folder / layout.MAPS
     rows = pq.read_table(path)
-    last = rows.column("map_id").to_pylist().index("fiji")
     names = rows.column("name").to_pylist()
-    names[last] = "changed"
+    names[rows.column("map_id").to_pylist().index("grandchild")] = "changed"
     pq.write_table(rows.set_column(rows.schema.get_field_index("name"), "name", [names]), path)
     rewritten(folder)
-    with pytest.raises(ExportError, match="map fiji: the files hold another map") as told:
+    with pytest.raises(
+        ExportError, match="map grandchild: the files hold another map.*; imported before it:"
+    ) as told:
         import_dataset(target, folder)
     there = [m.map_id for m in target.snapshot().any_maps(include_retired=True)]
-    assert ("imported before it" in str(told.value)) == bool(there)
+    assert {"karlsruhe", "child"} <= set(there)  # its parents come before it
     assert all(map_id in str(told.value) for map_id in there)
+
+
+def test_a_new_map_below_one_that_is_retired_here_is_held_back(
+    source: Database, exported: Path, target: Database, tmp_path: Path
+) -> None:
+    export(source, tmp_path / "one", replace(EVERYTHING, maps=("karlsruhe",)))
+    import_dataset(target, tmp_path / "one", trusted=True)
+    target.retire("karlsruhe", "a wrong lens")
+    done = import_dataset(target, exported, trusted=True)
+    assert "karlsruhe" in done.quarantined["grandchild"]
+    statuses = {m.map_id: m.status for m in target.snapshot().maps(include_retired=True)}
+    assert (statuses["karlsruhe"], statuses["grandchild"]) == ("retired", "quarantined")
+    assert statuses["fiji"] == "active"
 
 
 def test_a_table_that_lacks_values_or_columns_is_told_in_a_line(folder: Path, target: Database) -> None:

@@ -313,10 +313,12 @@ def _check_rows(folder: Path, rows: Sequence[Row], digests: Mapping[str, str]) -
 def _missing_parents(rows: Sequence[Row], live: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
     """Active maps of the dataset without a chain to an anchor, and the maps that they would need for one.
 
+    Retired maps are no part of a chain.
+
     Args:
         live: parents of the maps that live in the database, by id.
     """
-    parents = {**live, **{row["map_id"]: row["parents"] for row in rows}}
+    parents = {**live, **{row["map_id"]: row["parents"] for row in rows if row["status"] != RETIRED}}
     known = [{"map_id": m, "parents": p, "status": ACTIVE} for m, p in parents.items()]
     standing = anchored(known)
     fallen = [r["map_id"] for r in rows if r["status"] == ACTIVE and r["map_id"] not in standing]
