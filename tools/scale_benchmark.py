@@ -24,6 +24,7 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from featuredb.features.decode import decode_gray
 from featuredb.features.extractor import extract
@@ -31,7 +32,6 @@ from featuredb.features.features import Features
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.index.descriptor_index import use_threads
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.subset import only_images, only_points
 from featuredb.store import Database
@@ -154,7 +154,7 @@ def first_start(path: Path, query: Query) -> float:
 
 def _started(path: Path, query: Query) -> tuple[Localiser, float]:
     """A localiser on one thread, with a cache of its own, and seconds until it has answered."""
-    use_threads(1)
+    threadpool_limits(1)
     os.environ["XDG_CACHE_HOME"] = f"{path}-cache"
     began = time.perf_counter()
     localiser = Localiser.open(Database.open(str(path)))

@@ -28,7 +28,8 @@ _FEW = 25_000
 _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the neighbour oftener, and slower
 _LISTS, _CODES = "list_centers.npz", "code_centers.npz"  # tools/train_vocabulary.py made them
 LISTS = 2048
-_AT_ONCE = 64  # descriptors that are compared with all lists: they make two megabytes
+_AT_ONCE = 256  # descriptors that are compared with all lists: two megabytes
+_SORTED = 32  # of these, whose lists are sorted at a time
 _CHUNK = 2_048  # descriptors at a time: bounds the copies
 
 
@@ -187,8 +188,11 @@ def _from_lists(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _probed(descriptors: NDArray[np.float32]) -> NDArray[np.int64]:
     """The lists (n, _PROBES) that descriptors (n, 128) are looked for in."""
-    order = np.argpartition(_from_lists(descriptors), _PROBES, axis=1)
-    return order[:, :_PROBES].astype(np.int64)  # a copy, since `order` is large
+    squared, lists = _from_lists(descriptors), np.empty((len(descriptors), _PROBES), np.int64)
+    for start in range(0, len(squared), _SORTED):
+        part = slice(start, start + _SORTED)
+        lists[part] = np.argpartition(squared[part], _PROBES, axis=1)[:, :_PROBES]
+    return lists
 
 
 @cache
