@@ -59,6 +59,9 @@ class LensPriors:
         unknown_focal_rel: without EXIF: a factor of two either way.
         radial: k1 of consumer lenses is within a few hundredths, phones' wide lenses up to 0.1.
         center_rel: principal points of consumer cameras lie within 1 % of the longer side of the middle.
+        cut_out_rel: of a picture cut out of a larger one. The middle of that is anywhere in a picture of half
+            its size: uniform, 0.5 / sqrt(3). Its focal length is not known either: EXIF's is that of the
+            whole.
         whole_lens: OPENCV's parameters are estimated, and not SIMPLE_RADIAL's alone. What a lens has beyond
             one radial coefficient leaves a pattern that passes for another focal length, and the covariance
             knows nothing of it: photos of a drone's lens had errors of 0.39 m at the median and 3.2 m at
@@ -71,6 +74,7 @@ class LensPriors:
     unknown_focal_rel: float = 0.7
     radial: float = 0.04
     center_rel: float = 0.01
+    cut_out_rel: float = 0.29
     whole_lens: bool = True
     second_radial: float = 0.04
     tangential: float = 0.001
@@ -80,6 +84,11 @@ class LensPriors:
         """What is known of a lens whose focal length is EXIF's, or a guess; None: it is told otherwise."""
         rel = {"exif": self.exif_focal_rel, "estimated": self.unknown_focal_rel}.get(source)
         return None if rel is None else self.around(camera, camera.focal_px, rel)
+
+    def of_part(self, camera: Camera) -> QueryLensPrior:
+        """What is known of the lens of a picture that was cut out of a larger one, or put into one."""
+        wide = replace(self, center_rel=self.cut_out_rel)
+        return wide.around(camera, camera.focal_px, self.unknown_focal_rel)
 
     def around(self, camera: Camera, focal_px: float, focal_rel: float) -> QueryLensPrior:
         """What is known of a lens of pictures of this camera's size, whose focal length is about this."""

@@ -24,13 +24,15 @@ from reloc.localise.answer import make_answer, placement_covariance
 from reloc.localise.candidates import IndexedArea, usable_areas
 from reloc.localise.lens_prior import seen_by_a_map
 from reloc.localise.options import LocaliseOptions
-from reloc.localise.pose import PoseUncertainty, pose_uncertainty
+from reloc.localise.pose import PoseUncertainty, pose_uncertainty, refined_as_part
 from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult
 from reloc.localise.search import PoseCandidate, pairs, search
 from reloc.wire.query import OwnPositionUse, PositionRole, Reason, RunnerUpPose
 
 # Chi-square with two degrees of freedom is above this once in 10,000 answers if the prior's sigma is honest.
 _CHI_SQUARE_LIMIT = 18.42
+
+_OF_PART = "; the middle of the picture is not that of its lens, as where it was cropped"
 
 # Phones between houses are off by tens of metres, whatever accuracy they write into a photo.
 _OWN_POSITION_SIGMA_M = 20.0
@@ -185,6 +187,11 @@ def _decide(
     if refusal is not None:
         return refuse(refusal[0], refusal[1], best.evidence.inliers, rival)
     pixels, points = pairs(features, best.area, best.matches)
+    part = None
+    if best.pose.camera_source in ("exif", "estimated") and request.film is None:
+        part = refined_as_part(pixels, points, best.pose, options.pose)
+    if part is not None:
+        best = replace(best, pose=part, rows=best.rows[part.inliers[best.rows]])
     rows = best.matches.point[best.rows]
     inliers = (pixels[best.rows], points[best.rows], best.area.point_covariance(rows))
     uncertainty = pose_uncertainty(*inliers, best.pose, options.pose)
@@ -204,7 +211,7 @@ def _decide(
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
     result = answered(
         reason=None,
-        detail=f"{best.evidence.inliers} inliers of {matches} matches",
+        detail=f"{best.evidence.inliers} inliers of {matches} matches{_OF_PART if part is not None else ''}",
         pose=answer,
         confidence=confidence(best.evidence, rival.inliers if rival else 0),
         inliers=best.evidence.inliers,

@@ -7,6 +7,7 @@ import numpy as np
 import poselib
 import pycolmap
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -14,8 +15,11 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.stop_signals import handle_as_before
 from reloc.localise.lens_prior import LensPriors, QueryLensPrior, pixel_jacobians
 from reloc.localise.options import PoseOptions
-from reloc.localise.self_calibration import calibrate, covariance_from_information
+from reloc.localise.self_calibration import calibrate, calibrate_anew, covariance_from_information
 from reloc.wire.query import CameraSource
+
+# Of twice the logarithm of the likelihood: one of twenty whole photos is above. Three parameters are freed.
+_PART_GAIN = float(chi2.isf(0.05, 3))
 
 handle_as_before()  # pycolmap's glog has put a handler there that prints a stack trace
 
@@ -153,6 +157,30 @@ def refine_pose(
             pose = _refine_known_lens(pixels, points, near, pose, tolerance_px)
     residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
     return replace(pose, inliers=residual < tolerance_px)
+
+
+def refined_as_part(
+    pixels: FloatArray, points: FloatArray, whole: PoseHypothesis, options: PoseOptions
+) -> PoseHypothesis | None:
+    """The pose of a picture cut out of a larger one, or put into one; None: it may be a whole photo.
+
+    Contradiction: the ratio of the likelihoods with the lens's axis anywhere and in the middle, by chi-square
+    (Wilks). What it costs to err is not the same: of a whole photo a wider bound, of a part a wrong pose.
+
+    Args:
+        pixels, points: (m, 2), (m, 3) of all matches. whole: refined, by what is known of whole photos.
+    """
+    tolerance_px = options.tolerance_px(whole.camera)
+    near = reprojection_errors(pixels, points, whole.camera, whole.cam_from_local) < 2.0 * tolerance_px
+    prior = options.lens.of_part(whole.camera)
+    moved, camera, gain = calibrate_anew(
+        pixels[near], points[near], whole.cam_from_local, whole.camera, prior, 0.25 * tolerance_px
+    )
+    if gain < _PART_GAIN:
+        return None
+    # Once more: how much the pixels count followed from the residuals of a whole photo.
+    part = replace(whole, cam_from_local=moved, camera=camera, lens_prior=prior)
+    return refine_pose(pixels, points, part, options)
 
 
 def _refine_known_lens(

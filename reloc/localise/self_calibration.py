@@ -35,6 +35,18 @@ def calibrate(
     Raises:
         InvalidValueError: the camera is of another model.
     """
+    return calibrate_anew(pixels, points, start_pose, start_camera, prior, noise_px)[:2]
+
+
+def calibrate_anew(
+    pixels: FloatArray,
+    points: FloatArray,
+    start_pose: Rigid3,
+    start_camera: Camera,
+    prior: QueryLensPrior,
+    noise_px: float,
+) -> tuple[Rigid3, Camera, float]:
+    """As `calibrate`, and twice the logarithm of how much likelier the pixels are than at the start."""
     camera = with_lens(start_camera, whole_lens(lens_of(start_camera))[: len(prior.mean)])
     problem = LensProblem(
         pixels=pixels,
@@ -43,7 +55,8 @@ def calibrate(
         trust=(noise_px / measured_noise_px(pixels, points, start_pose, camera, noise_px)) ** 2,
         prior=prior,
     )
-    return _minimise(problem, start_pose, camera)
+    found = _minimise(problem, start_pose, camera)
+    return *found, 2.0 * (problem.cost_of_pixels(start_pose, camera) - problem.cost_of_pixels(*found))
 
 
 def covariance_from_information(information: FloatArray) -> FloatArray:

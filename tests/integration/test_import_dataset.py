@@ -221,7 +221,7 @@ def test_maps_that_came_before_a_broken_one_are_named(folder: Path, target: Data
     pq.write_table(rows.set_column(rows.schema.get_field_index("name"), "name", [names]), path)
     rewritten(folder)
     with pytest.raises(
-        ExportError, match="map grandchild: the files hold another map.*; imported before it:"
+        ExportError, match=r"map grandchild: the files hold another map.*; imported before it:"
     ) as told:
         import_dataset(target, folder)
     there = [m.map_id for m in target.snapshot().any_maps(include_retired=True)]

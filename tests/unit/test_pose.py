@@ -16,6 +16,7 @@ from reloc.localise.pose import (
     estimate_pose,
     pose_uncertainty,
     refine_pose,
+    refined_as_part,
     reprojection_errors,
 )
 from tests.support.scenes import CAMERA, box_points, looking_at, pixels_inside
@@ -74,6 +75,35 @@ def test_a_free_focal_length_with_outliers(seed: int, guess: float) -> None:
     assert (found.inliers & true).sum() > 0.95 * true.sum()
     assert found.lens_prior is not None
     assert found.lens_prior.mean[0] == guess
+
+
+def whole_and_part(
+    seed: int, camera: Camera, noise_px: float = 0.5
+) -> tuple[PoseHypothesis, PoseHypothesis | None, np.ndarray, np.ndarray]:
+    """A photo whose lens nobody knows, as of a whole photo and as of a part of one, with its matches."""
+    pixels, points, _ = scene(seed, 200, noise_px=noise_px, camera=camera)
+    found = estimate_pose(pixels, points, Camera.from_focal(1000, 800, 1200.0), "estimated", OPTIONS)
+    assert found is not None
+    whole = refine_pose(pixels, points, found, OPTIONS)
+    return whole, refined_as_part(pixels, points, whole, OPTIONS), pixels, points
+
+
+def test_a_picture_that_was_cut_out_of_a_photo_is_placed_with_the_middle_of_its_lens() -> None:
+    cut = replace(TRUE_LENS, params=(1100.0, 760.0, 290.0, 0.01))
+    squared = []
+    for seed in range(8):
+        whole, part, pixels, points = whole_and_part(seed, cut)
+        assert part is not None
+        assert errors(part.cam_from_local)[0] < 0.3 * errors(whole.cam_from_local)[0]
+        own = (pixels[part.inliers], points[part.inliers])
+        uncertainty = pose_uncertainty(*own, np.zeros((len(own[0]), 3, 3)), part, OPTIONS)
+        squared.append(normalised_squared_error(part.cam_from_local, uncertainty.covariance))
+    assert np.median(squared) < 16.8  # of six: 99 %
+
+
+def test_a_whole_photo_is_hardly_ever_taken_for_a_part_of_one() -> None:
+    parts = [whole_and_part(seed, TRUE_LENS)[1] for seed in range(20)]
+    assert sum(part is not None for part in parts) <= 4  # one of twenty is allowed; 0.3 % have more than four
 
 
 def test_the_same_input_gives_the_same_pose() -> None:
