@@ -1,7 +1,7 @@
 """What is known of one file of an ingest; which photos share intrinsics; where they say they were taken."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -160,6 +160,21 @@ def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> F
     if frame is None:
         frame = LocalFrame(latitude_deg=geodetic[0, 0], longitude_deg=geodetic[0, 1], height_m=0.0)
     return frame.enu_from_geodetic(geodetic)
+
+
+def without_unset_heights(photos: Sequence[Photo]) -> tuple[list[Photo], tuple[str, ...]]:
+    """The photos, without heights that are exactly zero, and a line on them.
+
+    Programs write zero where they know no height; taken at its word it lays a map at sea level. Where it is
+    one, the other photos tell it as well.
+    """
+    unset = {photo.name for photo in photos if photo.gps is not None and photo.gps.height_m == 0.0}
+    if not unset:
+        return list(photos), ()
+    note = f"the heights of {len(unset)} photos are exactly zero, and are taken as unknown"
+    return [
+        replace(p, gps=replace(p.gps, height_m=None)) if p.gps and p.name in unset else p for p in photos
+    ], (note,)
 
 
 def _geodetic(photos: Sequence[Photo]) -> FloatArray:

@@ -26,7 +26,7 @@ from featuredb.maps.feature_map import GeoPrior, prior_from_exif
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.photos.duplicates import MAX_BITS, exact_duplicates, near_duplicates, picture_hash
-from ingest.photos.photo import Photo
+from ingest.photos.photo import Photo, without_unset_heights
 from ingest.photos.table import PhotoTable, TableRow, is_table, read_table, summary_of
 from ingest.photos.walk import ExaminedFile, FoundFile, read_cache, refused, walk, write_cache
 
@@ -72,7 +72,7 @@ class ScanResult:
     Attributes:
         photos: all files, used or not, sorted by name.
         read: files that were opened; the others were in the cache or refused by their name.
-        notes: what is wrong with the table, where there is one.
+        notes: what is wrong with the table, where there is one, and with heights.
     """
 
     photos: tuple[Photo, ...]
@@ -165,8 +165,9 @@ def _scan_files(
     photos = [_as_photo(file, examined.get(file.name), options) for file in files]
     notes = _far_from_exif(photos, rows)
     photos = [_with_row(p, rows[p.name], options) if p.name in rows else p for p in photos]
+    photos, unset = without_unset_heights(photos)
     photos = _without_copies(photos, {name: e.picture_hash for name, e in examined.items()})
-    return ScanResult(photos=tuple(photos), read=read, notes=notes)
+    return ScanResult(photos=tuple(photos), read=read, notes=(*notes, *unset))
 
 
 def _far_from_exif(photos: Sequence[Photo], rows: Mapping[str, TableRow]) -> tuple[str, ...]:

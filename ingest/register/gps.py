@@ -139,14 +139,16 @@ def _judged(
     if by > 1.0:  # what each is off by shows among them, but not what all share: a datum of heights, a map
         shared = np.hypot(np.minimum(bias, white) / np.sqrt(by - 1.0), _MANY_SHARE * stated)
         bias[:2] = np.minimum(bias, shared)[:2]
+    noise = np.sqrt(white**2 + drift**2 / 3.0)
+    above = np.log(noise / (np.maximum(stated, _PLAIN_M) * NOISE_SHARE))  # deviations of a receiver's noise
+    # Noisier than any receiver: two data of heights, another clock. These are shared, and do not average out.
+    bias = np.where(above > -ndtri(_NO_PLACE), np.maximum(bias, noise), bias)
     each = int(fit.used.all(axis=1).sum()) / by if by > 1.0 else 1.0  # positions by one of many
     covariance = each * fit.covariance
     covariance[4:, 4:] += np.diag(bias**2)
-    rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]
-    usual = np.maximum(stated, _PLAIN_M)[known.any(axis=0)] * NOISE_SHARE
-    above = float(np.log(rms / usual).max())  # standard deviations of a receiver's noise
+    rms, most = noise[known.any(axis=0)], float(above[known.any(axis=0)].max())
     # Where positions are noisier than usual, those along another way would be, too: fewer of them count.
-    unusual = above > -ndtri(_NO_PLACE)
+    unusual = most > -ndtri(_NO_PLACE)
     chance = fit.log_chance_of_path if unusual else fit.log_chance
     inliers = np.asarray(fit.used.all(axis=1))
     turn_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])))
@@ -176,7 +178,7 @@ def _judged(
         figures=figures,
     )
     refused = -ndtri(_WRONG if chance <= np.log(_NO_PLACE) else _NO_PLACE)
-    if above > refused or inliers.sum() < _LEAST_PHOTOS:
+    if most > refused or inliers.sum() < _LEAST_PHOTOS:
         height = f" and {rms[2]:.0f} m in height" if len(rms) == 3 else ""
         words = (
             f"the photos' GPS does not fit the reconstruction: {inliers.sum()} of {len(inliers)} positions "

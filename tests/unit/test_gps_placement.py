@@ -45,6 +45,19 @@ def test_sigmas_weigh_the_positions() -> None:
     assert (shift[:, :2] ** 2).sum() < (plain_shift[:, :2] ** 2).sum()
 
 
+def test_heights_of_two_data_are_stated_as_wide_as_they_are_apart() -> None:
+    """Every second one counts from the ground: that is no noise which averages out, so 18 are no better."""
+    noise = np.random.default_rng(5).normal(0, [0.5, 0.5, 1.0], (18, 3))
+    noise[1::2, 2] -= 150.0
+    placed = place(flight(18), noise, np.tile([4.0, 4.0, 10.0], (18, 1)))
+    assert placed.local_from_sfm is not None
+    assert placed.covariance is not None
+    sigma = np.sqrt(np.diag(placed.covariance)[4:])
+    off = (placed.local_from_sfm @ TRUE.inverse()).act(np.zeros((1, 3)))[0]
+    assert 50.0 < abs(off[2]) < 1.96 * sigma[2]
+    assert sigma[:2].max() < 5.0
+
+
 def _scores(noise: Callable[[np.random.Generator], FloatArray], draws: int, count: int) -> FloatArray:
     """Squared errors of the seven parameters over their covariance, of plain receivers."""
     scores = []

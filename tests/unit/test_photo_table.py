@@ -154,6 +154,18 @@ def test_what_the_table_says_of_heights_goes_before_exif(tmp_path: Path) -> None
     assert (two.height_m, two.sigma_horizontal_m, two.sigma_vertical_m) == (130.0, 2.0, 5.0)
 
 
+def test_heights_of_exactly_zero_are_taken_as_unknown(tmp_path: Path) -> None:
+    for number, name in enumerate(("one.jpg", "two.jpg")):
+        Image.new("L", (320, 240), 99 * number).save(tmp_path / name)
+    table = tmp_path / "photos.csv"
+    for zero, heights in (("0.0", [None, 2.0]), ("-0.01", [-0.01, 2.0])):
+        table.write_text(f"path,lat,lon,height,accuracy\none.jpg,48,8,{zero},4\ntwo.jpg,48.001,8,2,4\n")
+        scanned = scan_table(read_table(table))
+        assert [photo.gps and photo.gps.height_m for photo in scanned.photos] == heights
+        told = "the heights of 1 photos are exactly zero, and are taken as unknown"
+        assert (told in scanned.notes) == (heights[0] is None)
+
+
 def test_a_table_of_another_place_than_exif_is_told_with_the_distance(tmp_path: Path) -> None:
     for number, name in enumerate(("one.jpg", "two.jpg", "three.jpg")):
         exif = Image.Exif()
