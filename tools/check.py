@@ -14,8 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-# Two tests run at a time on two cores: threads of their libraries beside them would only wait for each other.
-# OpenCV's even take time while they wait: a sixth of that of SIFT.
+# Three tests run at a time on two cores: threads of their libraries beside them would only wait for each
+# other. OpenCV's even take time while they wait: a sixth of that of SIFT.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 # Some machines tell Python not to keep bytecode. Then every process compiles all that it imports,
 # for seconds, and tests start many processes.
@@ -29,9 +29,10 @@ def main() -> int:
     much.add_argument("--all", action="store_true", help="also run the studies and the whole demo")
     args = parser.parse_args()
     python = sys.executable
-    # Two at a time, a file on one worker each, since modules share what they have made; in the order of
-    # their folders, which leaves the short ones to the end, when one worker may have to wait for the other.
-    pytest = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
+    # Three at a time, as a third of the tests' time is spent waiting; a file on one worker, since modules
+    # share what they have made; in the order of their folders, which leaves the short ones to the end, when
+    # one worker may have to wait for the others.
+    pytest = [python, "-m", "pytest", "-q", "-n", "3", "--dist", "loadfile", "--no-loadscope-reorder"]
     pytest += ["--durations", "250"]
     steps = {
         "format": [python, "-m", "ruff", "format", "--check", "."],
