@@ -146,7 +146,7 @@ class Area:
         pairs = [(np.zeros(0, np.intp), np.zeros(0, np.intp))]
         for number in np.unique(self.map_of(rows)):
             segment = self.segments[number]
-            seen = segment.see_point + self.point_start[number]
+            seen = segment.see_point.astype(np.int64) + self.point_start[number]
             position = np.minimum(np.searchsorted(rows, seen), len(rows) - 1)
             hit = np.flatnonzero(rows[position] == seen)
             image = np.searchsorted(segment.image_start, hit, side="right") - 1 + self.image_start[number]

@@ -5,6 +5,7 @@ that carry descriptors are in it.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class Segment:
         image_pose: (i, 3, 4) float64, rotation and translation of MapImage.cam_from_local.
         image_covariance: (i, 6, 6) float64, MapImage.covariance; NaN where there is none.
         image_start: (i + 1,) int64, slices of see_point for each image.
-        see_point: (s,) int32, points that the image sees, ascending.
+        see_point: (s,) uint16 of up to 65,536 points, else int32, points that the image sees, ascending.
         image_center: (i, 3) float64, camera centres.
         image_scene: (i, 3) float64, median of the points that the image sees.
         image_reach: (i,) float64, median distance of those points from the camera.
@@ -60,7 +61,7 @@ class Segment:
     image_pose: FloatArray
     image_covariance: FloatArray
     image_start: NDArray[np.int64]
-    see_point: NDArray[np.int32]
+    see_point: NDArray[np.uint16] | NDArray[np.int32]
     image_center: FloatArray
     image_scene: FloatArray
     image_reach: FloatArray
@@ -70,6 +71,11 @@ class Segment:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+def row_type(points: int) -> np.dtype[Any]:
+    """Of Segment.see_point."""
+    return np.dtype("<u2" if points <= 1 << 16 else "<i4")
 
 
 def full_roots(lower: NDArray[np.float16]) -> FloatArray:
@@ -125,7 +131,7 @@ def segment_of(feature_map: FeatureMap) -> Segment:
             [np.full((6, 6), np.nan) if image.covariance is None else image.covariance for image in images]
         ).reshape(-1, 6, 6),
         image_start=start.astype(np.int64),
-        see_point=see_point.astype(np.int32),
+        see_point=see_point.astype(row_type(len(rows))),
         image_center=centers,
         image_scene=scene,
         image_reach=reach,

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from featuredb.atomic import atomic_file, user_cache
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.index.descriptor_index import CODE_BYTES, LISTS, trained_digest
-from featuredb.index.segment import Segment
+from featuredb.index.segment import Segment, row_type
 
 _LOG = logging.getLogger(__name__)
-_LAYOUT = "2"  # raised where the same arrays come to mean something else
+_LAYOUT = "3"  # raised where the same arrays come to mean something else
 _SUFFIX = ".arrow"
 # Of each array of a segment, the type and the shape of a row.
 _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -44,7 +44,7 @@ _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "image_pose": ("<f8", (3, 4)),
     "image_covariance": ("<f8", (6, 6)),
     "image_start": ("<i8", ()),
-    "see_point": ("<i4", ()),
+    "see_point": ("<i4", ()),  # "<u2" of few points
     "image_center": ("<f8", (3,)),
     "image_scene": ("<f8", (3,)),
     "image_reach": ("<f8", ()),
@@ -174,7 +174,7 @@ def _layout() -> str:
 def _write(path: Path, segment: Segment) -> None:
     schema = pa.schema([pa.field(name, pa.large_binary()) for name in _ARRAYS])
     columns = []
-    for name, (dtype, _) in _ARRAYS.items():
+    for name, (dtype, _) in _kinds(len(segment)).items():
         array = np.ascontiguousarray(getattr(segment, name), dtype)
         offsets = pa.py_buffer(np.array([0, array.nbytes], np.int64))
         columns.append(pa.Array.from_buffers(pa.large_binary(), 1, [None, offsets, pa.py_buffer(array)]))
@@ -186,9 +186,15 @@ def _segment_of(content: mmap.mmap) -> Segment:
     """Raises ValueError, KeyError, TypeError, IndexError, ArrowException: it is none."""
     with pa.ipc.open_file(pa.BufferReader(pa.py_buffer(content))) as reader:
         batch = reader.get_batch(0)
-    segment = Segment(**{name: _array(batch.column(name), *kind) for name, kind in _ARRAYS.items()})
+    kinds = _kinds(len(_array(batch.column("points"), *_ARRAYS["points"])))
+    segment = Segment(**{name: _array(batch.column(name), *kind) for name, kind in kinds.items()})
     _check(segment)
     return segment
+
+
+def _kinds(points: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Types and shapes of the arrays of a segment of so many points."""
+    return _ARRAYS | {"see_point": (row_type(points).str, ())}
 
 
 def _array(column: pa.Array, dtype: str, tail: tuple[int, ...]) -> NDArray[Any]:

@@ -11,7 +11,7 @@ import pytest
 
 from featuredb.index.descriptor_index import LISTS
 from featuredb.index.segment import Segment, segment_of
-from featuredb.index.segment_files import SegmentFiles, _write
+from featuredb.index.segment_files import SegmentFiles, _kinds, _write
 from tests.support.maps import random_map
 
 
@@ -85,11 +85,16 @@ def of_no_such_list(path: Path) -> None:
 
 
 def of_no_such_point(path: Path) -> None:
-    rewritten(path, see_point=Made().segment.see_point + np.int32(100_000))
+    rewritten(path, see_point=Made().segment.see_point.astype(np.int32) + np.int32(100_000))
 
 
 def of_slices_that_go_back(path: Path) -> None:
     rewritten(path, image_start=Made().segment.image_start[::-1])
+
+
+def test_points_that_images_see_take_two_bytes_where_these_tell_all() -> None:
+    assert Made().segment.see_point.dtype == np.uint16
+    assert [_kinds(points)["see_point"][0] for points in (1 << 16, (1 << 16) + 1)] == ["<u2", "<i4"]
 
 
 @pytest.mark.parametrize(
