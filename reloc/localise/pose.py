@@ -7,7 +7,7 @@ import numpy as np
 import poselib
 import pycolmap
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -19,7 +19,7 @@ from reloc.localise.self_calibration import calibrate, calibrate_anew, covarianc
 from reloc.wire.query import CameraSource
 
 # Of twice the logarithm of the likelihood: one of twenty whole photos is above. Three parameters are freed.
-_PART_GAIN = float(chi2.isf(0.05, 3))
+_PART_GAIN = float(chdtri(3, 0.05))
 
 handle_as_before()  # pycolmap's glog has put a handler there that prints a stack trace
 
