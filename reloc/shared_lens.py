@@ -124,8 +124,8 @@ def shared_lens(views: Sequence[LensView]) -> SharedLens | None:
         pixels, points, trust = view.pixels, view.points, (noise_px / own_px) ** 2
         problem = LensProblem(pixels=pixels, points=points, noise_px=noise_px, trust=trust, prior=prior)
         problems.append(problem)
-        own = calibrate(pixels, points, view.cam_from_local, view.camera, prior, noise_px)
-        alone.append(problem.cost_of_pixels(*own))
+        moved, lens, _ = calibrate(pixels, points, view.cam_from_local, view.camera, prior, noise_px)
+        alone.append(problem.cost_of_pixels(moved, lens))
     while agree.sum() >= _LEAST_PHOTOS:
         rows = [int(r) for r in np.flatnonzero(agree)]
         start = views[max(rows, key=lambda r: len(views[r].pixels))].camera

@@ -15,7 +15,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.stop_signals import handle_as_before
 from reloc.localise.lens_prior import LensPriors, QueryLensPrior, pixel_jacobians
 from reloc.localise.options import PoseOptions
-from reloc.localise.self_calibration import calibrate, calibrate_anew, covariance_from_information
+from reloc.localise.self_calibration import calibrate, covariance_from_information
 from reloc.wire.query import CameraSource
 
 # Of twice the logarithm of the likelihood: one of twenty whole photos is above. Three parameters are freed.
@@ -151,7 +151,7 @@ def refine_pose(
             break
         if pose.lens_prior is not None:
             problem = (pose.cam_from_local, pose.camera, pose.lens_prior)
-            moved, camera = calibrate(pixels[near], points[near], *problem, 0.25 * tolerance_px)
+            moved, camera, _ = calibrate(pixels[near], points[near], *problem, 0.25 * tolerance_px)
             pose = replace(pose, cam_from_local=moved, camera=camera)
         else:
             pose = _refine_known_lens(pixels, points, near, pose, tolerance_px)
@@ -173,14 +173,15 @@ def refined_as_part(
     tolerance_px = options.tolerance_px(whole.camera)
     near = reprojection_errors(pixels, points, whole.camera, whole.cam_from_local) < 2.0 * tolerance_px
     prior = options.lens.of_part(whole.camera)
-    moved, camera, gain = calibrate_anew(
+    moved, camera, gain = calibrate(
         pixels[near], points[near], whole.cam_from_local, whole.camera, prior, 0.25 * tolerance_px
     )
     if gain < _PART_GAIN:
         return None
     # Once more: how much the pixels count followed from the residuals of a whole photo.
     part = replace(whole, cam_from_local=moved, camera=camera, lens_prior=prior)
-    return refine_pose(pixels, points, part, options)
+    found = refine_pose(pixels, points, part, options)
+    return found if found.inliers.sum() >= whole.inliers.sum() else None
 
 
 def _refine_known_lens(

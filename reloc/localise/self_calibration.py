@@ -22,7 +22,7 @@ def calibrate(
     start_camera: Camera,
     prior: QueryLensPrior,
     noise_px: float,
-) -> tuple[Rigid3, Camera]:
+) -> tuple[Rigid3, Camera, float]:
     """Refined cam_from_local and lens, of as many parameters as the prior has.
 
     Gauss-Newton with Cauchy weights; converges in a few steps from a RANSAC pose.
@@ -32,21 +32,12 @@ def calibrate(
         noise_px: residuals of this size are normal; scale of the Cauchy loss. How much the pixels count
             against the priors follows from the residuals at the start.
 
+    Returns:
+        With them twice the logarithm of how much likelier the pixels are than at the start.
+
     Raises:
         InvalidValueError: the camera is of another model.
     """
-    return calibrate_anew(pixels, points, start_pose, start_camera, prior, noise_px)[:2]
-
-
-def calibrate_anew(
-    pixels: FloatArray,
-    points: FloatArray,
-    start_pose: Rigid3,
-    start_camera: Camera,
-    prior: QueryLensPrior,
-    noise_px: float,
-) -> tuple[Rigid3, Camera, float]:
-    """As `calibrate`, and twice the logarithm of how much likelier the pixels are than at the start."""
     camera = with_lens(start_camera, whole_lens(lens_of(start_camera))[: len(prior.mean)])
     problem = LensProblem(
         pixels=pixels,

@@ -85,9 +85,9 @@ def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told
     )
     seen = seen_by_a_map(told, uncertainty)
     assert seen is not None
-    by_doubt, _ = calibrate(pixels, bent, Rigid3.identity(), *seen, 1.0)
+    by_doubt, *_ = calibrate(pixels, bent, Rigid3.identity(), *seen, 1.0)
     exact = QueryLensPrior(mean=seen[1].mean, sigma=np.full(8, 1e-7))
-    as_told, _ = calibrate(pixels, bent, Rigid3.identity(), seen[0], exact, 1.0)
+    as_told, *_ = calibrate(pixels, bent, Rigid3.identity(), seen[0], exact, 1.0)
     assert np.linalg.norm(by_doubt.center) < 0.5 * np.linalg.norm(as_told.center)
 
 

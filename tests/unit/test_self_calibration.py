@@ -45,7 +45,7 @@ def run(
     pixels: FloatArray, points: FloatArray, start: Rigid3, focal_px: float, focal_sigma: float
 ) -> tuple[Rigid3, Camera]:
     camera = Camera.from_focal(WIDTH, HEIGHT, focal_px)
-    return calibrate(pixels, points, start, camera, PRIORS.around(camera, focal_px, focal_sigma), 0.6)
+    return calibrate(pixels, points, start, camera, PRIORS.around(camera, focal_px, focal_sigma), 0.6)[:2]
 
 
 def shifted(pose: Rigid3, metres: FloatArray, axis_angle: FloatArray) -> Rigid3:
@@ -79,7 +79,7 @@ def test_a_deep_scene_tells_pose_and_lens(guess: float) -> None:
     np.testing.assert_allclose(PRIORS.around(camera, guess, 0.7).sigma, known)
     prior = replace(PRIORS, whole_lens=False).around(camera, guess, 0.7)
     np.testing.assert_allclose(prior.sigma, known[:4])
-    _, simple = calibrate(pixels, points, start, camera, prior, 0.6)
+    _, simple, _ = calibrate(pixels, points, start, camera, prior, 0.6)
     assert simple.model == "SIMPLE_RADIAL"
     np.testing.assert_allclose(simple.params, TRUE.params, atol=0.5)
 
@@ -141,7 +141,7 @@ def test_a_flat_scene_keeps_the_prior_and_finds_the_valley_from_anywhere() -> No
     for height_m, focal_px in ((40.0, 600.0), (60.0, 900.0), (90.0, 1350.0)):
         start = Rigid3(rotation=NADIR.rotation, translation=[0.0, 0.0, height_m])
         camera = Camera.from_focal(WIDTH, HEIGHT, focal_px)
-        found, lens = calibrate(pixels, points, start, camera, PRIORS.around(camera, 1000.0, 0.15), 0.6)
+        found, lens, _ = calibrate(pixels, points, start, camera, PRIORS.around(camera, 1000.0, 0.15), 0.6)
         assert lens.focal_px == pytest.approx(1000.0, rel=0.02)
         ratio = found.center[2] / lens.focal_px
         assert ratio == pytest.approx(60.0 / 900.0, rel=2e-3)
@@ -223,7 +223,7 @@ def test_degenerate_input_comes_back_finite(kind: str) -> None:
     elif kind == "line":
         points = points[0] + np.linspace(0, 1, len(points))[:, None] * [5.0, 2.0, 1.0]
         pixels = TRUE.project(pose.act(points))
-    found, lens = calibrate(pixels, points, pose, camera, PRIORS.around(camera, 900.0, 0.7), 0.6)
+    found, lens, _ = calibrate(pixels, points, pose, camera, PRIORS.around(camera, 900.0, 0.7), 0.6)
     assert np.isfinite(found.matrix()).all()
     assert np.isfinite(lens.params).all()
     assert 0 < lens.focal_px < 1e5
