@@ -247,8 +247,10 @@ def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None
         row = frame.index - first
         if points[row].found:
             continue
-        goes_on = row > 0 and points[row - 1].found
-        points[row] = replace(point_of(frame), state="tracking" if goes_on else "relocalised")
+        points[row] = point_of(frame)
+        if points[row].found:
+            goes_on = row > 0 and points[row - 1].found
+            points[row] = replace(points[row], state="tracking" if goes_on else "relocalised")
     if late and points[-1].state == "relocalised" and len(points) > 1 and points[-2].found:
         points[-1] = replace(points[-1], state="tracking")
 

@@ -143,7 +143,10 @@ class Tracker:
         self._sent = None
 
     def finish(self) -> Sequence[TrackedFrame]:
-        """After the last frame: poses of those before it that a frame still being looked for has found."""
+        """After the last frame: poses of those before it that a frame still being looked for has found.
+
+        Or why that frame is lost, which was not known when it came.
+        """
         sent, self._sent, followed = self._sent, None, self._track
         if self._options.live or followed is not None:
             return ()
@@ -151,7 +154,12 @@ class Tracker:
         last, fitted = self._frames.last, None
         if sent is not None and last is not None:
             answered = sent.answer.result()
-            if not isinstance(answered, Unmatched):
+            if isinstance(answered, Unmatched):
+                self._lost(f"{answered.reason}: {answered.detail}")
+                self.late = [
+                    TrackedFrame(index=last.index, time_s=last.time_s, state="lost", detail=self._why)
+                ]
+            else:
                 fitted = self._taken(answered, sent.index)
         if self._catching is not None:
             fitted = self._caught_up_by(_FAR)

@@ -177,6 +177,15 @@ def test_a_film_that_ends_before_the_answer_has_its_poses(
         assert not tracker.finish()
 
 
+def test_a_film_that_ends_before_it_is_refused_says_why(areas: tuple[IndexedArea, ...]) -> None:
+    with Tracker(MapFinder(areas), CAMERA, OPTIONS) as tracker:
+        for i in range(3):
+            tracker.track(_render(field_texture(9), pose_at(0), 0), i / 30.0)
+        (last,) = tracker.finish()
+    assert (last.index, last.state) == (2, "lost")
+    assert last.detail.startswith("TOO_FEW_")
+
+
 def test_a_found_track_catches_up_a_few_frames_at_a_time(
     areas: tuple[IndexedArea, ...], film: list[np.ndarray]
 ) -> None:
