@@ -214,7 +214,7 @@ def _judged(
     if angles.get("upside_down") or angles.get("tilt_off_deg", 0.0) > _LEANS_DEG:
         provisional = (
             "the positions lay the photos on their sides or upside down: latitude and longitude may be "
-            "exchanged, or pictures stored rotated"
+            "exchanged, one of them may lack its sign, or pictures are stored rotated"
         )
     message = "placed by GPS" if provisional else _words("placed by GPS", figures)
     return outcome(reason=None, message=message, provisional=provisional)

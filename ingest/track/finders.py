@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,10 @@ class FilmGround:
     maps: tuple[str, ...] | None = None
     scans: tuple[str, ...] | None = None
     pose_file: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.by not in get_args(FilmBy):
+            raise InvalidValueError(f"by: expected one of {', '.join(get_args(FilmBy))}, found {self.by!r}")
 
 
 def finder_for(database: Database, asked: FilmGround, camera: Camera | None, options: TrackOptions) -> Finder:

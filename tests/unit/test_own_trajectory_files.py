@@ -123,3 +123,8 @@ def test_what_needs_a_place_is_refused_before_the_film_is_opened(
 ) -> None:
     code = main(["track", database.url, "no film", "--map", random_unplaced_map().map_id, *asked])
     assert (code, said in capsys.readouterr().err) == (2, True)
+
+
+def test_what_a_film_is_followed_by_is_one_of_three() -> None:
+    with pytest.raises(InvalidValueError, match="by: expected one of map, scan, both, found 'maps'"):
+        FilmGround(by="maps")  # type: ignore[arg-type]
