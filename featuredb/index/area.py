@@ -104,10 +104,8 @@ class Area:
         root = self.points.turns[self.map_of(rows)] @ full_roots(self.covariance_root[rows])
         return np.asarray(root @ np.swapaxes(root, 1, 2), dtype=np.float64)
 
-    def codes(self, rows: NDArray[np.integer] | None = None) -> DescriptorCodes:
-        """Of the descriptors of these points (k,), or of all."""
-        if rows is None:
-            return DescriptorCodes(lists=self.lists.whole(), codes=self.code.whole())
+    def codes(self, rows: NDArray[np.integer]) -> DescriptorCodes:
+        """Of the descriptors of these points (k,)."""
         return DescriptorCodes(lists=self.lists[rows], codes=self.code[rows])
 
     def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:

@@ -11,6 +11,7 @@ from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.area import Area, build_area
 from featuredb.index.descriptor_index import DescriptorCodes, DescriptorIndex, squared_distances
+from featuredb.index.segment_index import SegmentIndex
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from reloc.localise.options import CandidateOptions
 
@@ -32,14 +33,14 @@ class IndexedArea:
     """
 
     area: Area
-    index: DescriptorIndex
+    index: SegmentIndex
     first: int = 0
 
     @classmethod
     def of(cls, maps: Sequence[FeatureMap]) -> "IndexedArea":
         """Maps of one extractor and height datum, laid out in one frame and ready to be asked."""
         area = build_area(maps)
-        return cls(area=area, index=DescriptorIndex.of(area.codes()))
+        return cls(area=area, index=SegmentIndex.of(area.segments))
 
     def only(self, map_ids: Collection[str]) -> "IndexedArea":
         """The same area and index, of which only these maps are searched."""
@@ -50,7 +51,7 @@ def indexed_together(areas: Sequence[Area], previous: Sequence[IndexedArea] = ()
     """The areas with one index for all of each extractor: a photo is looked for in all of them at once.
 
     Args:
-        previous: taken over where all areas of an extractor are the same.
+        previous: taken over where all areas of an extractor are the same; else of their index what it has.
     """
     indexed: dict[int, IndexedArea] = {}
     for fingerprint in {area.extractor_fingerprint for area in areas}:
@@ -59,7 +60,8 @@ def indexed_together(areas: Sequence[Area], previous: Sequence[IndexedArea] = ()
         if [id(one.area) for one in had] == [id(areas[k]) for k in mine]:
             indexed |= dict(zip(mine, had, strict=True))
             continue
-        index = DescriptorIndex.of(DescriptorCodes.joined([areas[k].codes() for k in mine]))
+        segments = [segment for k in mine for segment in areas[k].segments]
+        index = SegmentIndex.of(segments, had[0].index if had else None)
         first = 0
         for k in mine:
             indexed[k] = IndexedArea(area=areas[k], index=index, first=first)
@@ -253,11 +255,11 @@ def _nearest_of(
     shared = in_reach >= _MOST * len(index)
     if shared:
         first = np.array([reach[i].indexed.first for i in group])
+        proposed = index.search(asked, _PROPOSED * k)
     else:
         codes = [reach[i].area.codes(reach[i].points) for i in group]
-        index = DescriptorIndex.of(DescriptorCodes.joined(codes))
         first = np.cumsum([0, *(len(part) for part in codes[:-1])])
-    proposed = index.search(asked, _PROPOSED * k)
+        proposed = DescriptorIndex.of(DescriptorCodes.joined(codes)).search(asked, _PROPOSED * k)
     order = np.argsort(first)
     place = order[np.maximum(np.searchsorted(first[order], proposed, side="right") - 1, 0)]
     row, squared = np.full(proposed.shape, -1, np.int64), np.full(proposed.shape, np.inf)

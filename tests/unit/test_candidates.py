@@ -262,5 +262,5 @@ def test_an_index_is_kept_where_its_areas_are_the_same() -> None:
     again = indexed_together(areas, first)
     assert all(one is other for one, other in zip(first, again, strict=True))
     fewer = indexed_together(areas[:2], first)
-    assert fewer[0].index is not first[0].index
+    assert fewer[0].index is fewer[1].index is not first[0].index
     assert len(fewer[0].index) == counts[0] + counts[1]
