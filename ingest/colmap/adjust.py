@@ -17,6 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from featuredb.adjust.problem import Problem
+from featuredb.adjust.shared_noise import shared_variance_px2
 from featuredb.adjust.terms import (
     Block,
     CenterPriors,
@@ -32,7 +33,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap.bridge import SfmPhoto, quiet, triangulation_settings, whole_model_of
-from ingest.colmap.precision import in_cameras, projected, shared_variance_px2
+from ingest.colmap.precision import in_cameras, projected
 from ingest.positions.center_priors import center_priors
 
 # COLMAP's own gates of mapping: 4 px at keypoints good to half a pixel, 1.5 degrees, 15 observations.
@@ -57,7 +58,7 @@ class AdjustOptions:
             28 mm), nominal focal lengths are met within 1 to 2 %.
         lens: of what is not known of any camera; its focal length is COLMAP's, from the photos.
         dilution: so many observations of the size that residuals have with what neighbours share
-            (`ingest.colmap.precision.shared_variance_px2`) count as one against these priors and positions: a
+            (`featuredb.adjust.shared_noise`) count as one against these priors and positions: a
             lens model's faults are common to whole photos too. On `brighton`, from above, EXIF's focal length
             of 2311 px comes to 2482 with 1, 2319 with 10, 2304 with 50, where its scan says 2303.
         max_iterations: of Ceres; only a net. Six photos of a strip whose mapping gave twice EXIF's focal

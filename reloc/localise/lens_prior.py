@@ -85,10 +85,18 @@ class LensPriors:
         rel = {"exif": self.exif_focal_rel, "estimated": self.unknown_focal_rel}.get(source)
         return None if rel is None else self.around(camera, camera.focal_px, rel)
 
-    def of_part(self, camera: Camera) -> QueryLensPrior:
-        """What is known of the lens of a picture that was cut out of a larger one, or put into one."""
+    def of_part(self, camera: Camera, *, distorts: bool) -> QueryLensPrior:
+        """What is known of the lens of a picture that was cut out of a larger one, zoomed, or put into one.
+
+        Args:
+            distorts: how much is not known either; otherwise it is as the camera has it.
+        """
         wide = replace(self, center_rel=self.cut_out_rel)
-        return wide.around(camera, camera.focal_px, self.unknown_focal_rel)
+        prior = wide.around(camera, camera.focal_px, self.unknown_focal_rel)
+        if distorts:
+            return prior
+        sigma = np.concatenate([prior.sigma[:3], _EXACT[3 : len(prior.sigma)]])
+        return replace(prior, mean=lens_of(camera), sigma=sigma)
 
     def around(self, camera: Camera, focal_px: float, focal_rel: float) -> QueryLensPrior:
         """What is known of a lens of pictures of this camera's size, whose focal length is about this."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import GeoPrior
@@ -22,7 +23,7 @@ from featuredb.stage_clock import StageClock
 from reloc.localise.acceptance import confidence, prior_tells, verdict
 from reloc.localise.answer import make_answer, placement_covariance
 from reloc.localise.candidates import IndexedArea, usable_areas
-from reloc.localise.lens_prior import seen_by_a_map
+from reloc.localise.lens_prior import QueryLensPrior, seen_by_a_map
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.pose import PoseUncertainty, pose_uncertainty, refined_as_part
 from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult
@@ -32,7 +33,7 @@ from reloc.wire.query import OwnPositionUse, PositionRole, Reason, RunnerUpPose
 # Chi-square with two degrees of freedom is above this once in 10,000 answers if the prior's sigma is honest.
 _CHI_SQUARE_LIMIT = 18.42
 
-_OF_PART = "; the middle of the picture is not that of its lens, as where it was cropped"
+_OF_PART = "; the picture's lens is not that of a whole photo, as where it was cropped or zoomed"
 
 # Phones between houses are off by tens of metres, whatever accuracy they write into a photo.
 _OWN_POSITION_SIGMA_M = 20.0
@@ -187,22 +188,20 @@ def _decide(
     if refusal is not None:
         return refuse(refusal[0], refusal[1], best.evidence.inliers, rival)
     pixels, points = pairs(features, best.area, best.matches)
-    part = None
-    if best.pose.camera_source in ("exif", "estimated") and request.film is None:
-        part = refined_as_part(pixels, points, best.pose, options.pose)
-    if part is not None:
-        best = replace(best, pose=part, rows=best.rows[part.inliers[best.rows]])
+    told = request.camera if request.camera_is_exact else None
+    seen = _lens_as_seen(best) if told is None and best.pose.lens_prior is None else None
+    known = best.pose.lens_prior or (seen and seen[1])
+    if known and best.pose.camera_source != "request" and not best.pose.part and request.film is None:
+        part = refined_as_part(pixels, points, best.pose, known, options.pose)
+        if part is not None:
+            best, seen = replace(best, pose=part, rows=best.rows[part.inliers[best.rows]]), None
     rows = best.matches.point[best.rows]
     inliers = (pixels[best.rows], points[best.rows], best.area.point_covariance(rows))
     uncertainty = pose_uncertainty(*inliers, best.pose, options.pose)
-    told = request.camera if request.camera_is_exact else None
     lent = None
-    if told is None and best.pose.lens_prior is None:
-        lent_by = LensUncertainty.of_provenance(best.main_map.provenance)
-        seen = None if lent_by is None else seen_by_a_map(best.pose.camera, lent_by)
-        if seen is not None and seen[0].model == best.pose.camera.model:
-            pose = replace(best.pose, camera=seen[0], lens_prior=seen[1])
-            lent = pose_uncertainty(*inliers, pose, options.pose)
+    if seen is not None:
+        pose = replace(best.pose, camera=seen[0], lens_prior=seen[1])
+        lent = pose_uncertainty(*inliers, pose, options.pose)
     answer = make_answer(
         best.area, best.pose, uncertainty, pixels[best.rows], rows, request.want_inliers, told, lent
     )
@@ -211,13 +210,20 @@ def _decide(
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
     result = answered(
         reason=None,
-        detail=f"{best.evidence.inliers} inliers of {matches} matches{_OF_PART if part is not None else ''}",
+        detail=f"{best.evidence.inliers} inliers of {matches} matches{_OF_PART if best.pose.part else ''}",
         pose=answer,
         confidence=confidence(best.evidence, rival.inliers if rival else 0),
         inliers=best.evidence.inliers,
         runner_up=rival,
     )
     return Localised(result=result, best=best, uncertainty=uncertainty)
+
+
+def _lens_as_seen(found: PoseCandidate) -> tuple[Camera, QueryLensPrior] | None:
+    """The lens that the map has lent, and how well the map knows it; None where the map does not say."""
+    known = LensUncertainty.of_provenance(found.main_map.provenance)
+    seen = None if known is None else seen_by_a_map(found.pose.camera, known)
+    return seen if seen is not None and seen[0].model == found.pose.camera.model else None
 
 
 def _offset(answer: LocalisedPose, prior: GeoPrior) -> FloatArray:

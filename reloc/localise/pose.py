@@ -9,17 +9,21 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from featuredb.adjust.shared_noise import design_effect
+from featuredb.adjust.terms import whole_camera
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.stop_signals import handle_as_before
-from reloc.localise.lens_prior import LensPriors, QueryLensPrior, pixel_jacobians
+from reloc.localise.lens_prior import LensPriors, QueryLensPrior, lens_of, pixel_jacobians, with_lens
 from reloc.localise.options import PoseOptions
 from reloc.localise.self_calibration import calibrate, covariance_from_information
 from reloc.wire.query import CameraSource
 
-# Of twice the logarithm of the likelihood: one of twenty whole photos is above. Three parameters are freed.
-_PART_GAIN = float(chdtri(3, 0.05))
+# Of twice the logarithm of the likelihood, by three parameters: one of twenty whole photos is above, and its
+# bound is wider then. A lens that a map has lent is known far better than a photo tells it: one of a
+# thousand.
+_PART_GAIN, _LENT_GAIN = float(chdtri(3, 0.05)), float(chdtri(3, 0.001))
 
 handle_as_before()  # pycolmap's glog has put a handler there that prints a stack trace
 
@@ -34,6 +38,7 @@ class PoseHypothesis:
         inliers: (m,) bool over the matches that it was estimated from.
         lens_prior: what was known of the lens beforehand, where it is estimated with the pose; None: it is
             exact.
+        part: the picture was cut out of a larger one, or zoomed.
     """
 
     cam_from_local: Rigid3
@@ -41,6 +46,7 @@ class PoseHypothesis:
     camera_source: CameraSource
     inliers: NDArray[np.bool_]
     lens_prior: QueryLensPrior | None = None
+    part: bool = False
 
     @property
     def count(self) -> int:
@@ -132,6 +138,27 @@ def _ransac_focal(
     return _from_pycolmap(found["cam_from_world"]), Camera.from_pycolmap(working)
 
 
+def with_any_lens(
+    pixels: FloatArray, points: FloatArray, found: PoseHypothesis, options: PoseOptions
+) -> PoseHypothesis | None:
+    """The pose of a picture that was cut out of a larger one or zoomed; None where there is none.
+
+    Args:
+        pixels, points: as of `estimate_pose`, which has found the pose of a whole photo.
+    """
+    start, pose = whole_camera(found.camera), found
+    if start.model != "OPENCV":
+        return None
+    if found.camera_source == "map":
+        freed = _ransac_focal(start, pixels, points, options.tolerance_px(start), options)
+        if freed is None:
+            return None
+        lens = with_lens(start, np.append(freed[1].focal_px, lens_of(start)[1:]))
+        pose = replace(found, cam_from_local=freed[0], camera=lens, camera_source="estimated")
+    prior = options.lens.of_part(start, distorts=found.camera_source != "map")
+    return refine_pose(pixels, points, replace(pose, lens_prior=prior, part=True), options)
+
+
 def refine_pose(
     pixels: FloatArray, points: FloatArray, start: PoseHypothesis, options: PoseOptions, rounds: int = 2
 ) -> PoseHypothesis:
@@ -160,28 +187,39 @@ def refine_pose(
 
 
 def refined_as_part(
-    pixels: FloatArray, points: FloatArray, whole: PoseHypothesis, options: PoseOptions
+    pixels: FloatArray,
+    points: FloatArray,
+    whole: PoseHypothesis,
+    known: QueryLensPrior,
+    options: PoseOptions,
 ) -> PoseHypothesis | None:
-    """The pose of a picture cut out of a larger one, or put into one; None: it may be a whole photo.
+    """The pose of a picture cut out of a larger one, zoomed, or put into one; None: it may be a whole photo.
 
-    Contradiction: the ratio of the likelihoods with the lens's axis anywhere and in the middle, by chi-square
-    (Wilks). What it costs to err is not the same: of a whole photo a wider bound, of a part a wrong pose.
+    Contradiction: the ratio of the likelihoods with any focal length and the lens's axis anywhere, and with
+    what is known of whole photos, by chi-square (Wilks), over what neighbouring residuals share.
 
     Args:
-        pixels, points: (m, 2), (m, 3) of all matches. whole: refined, by what is known of whole photos.
+        pixels, points: (m, 2), (m, 3) of all matches. whole: refined, as of a whole photo.
+        known: what is known of its lens, also where a map has lent it and it is not estimated.
     """
+    lent = whole.lens_prior is None
     tolerance_px = options.tolerance_px(whole.camera)
     near = reprojection_errors(pixels, points, whole.camera, whole.cam_from_local) < 2.0 * tolerance_px
-    prior = options.lens.of_part(whole.camera)
-    moved, camera, gain = calibrate(
-        pixels[near], points[near], whole.cam_from_local, whole.camera, prior, 0.25 * tolerance_px
-    )
-    if gain < _PART_GAIN:
+    seen = (pixels[near], points[near], whole.cam_from_local, whole.camera)
+    prior = options.lens.of_part(whole.camera, distorts=not lent)
+    moved, camera, gain = calibrate(*seen, prior, 0.25 * tolerance_px)
+    if lent:
+        gain -= calibrate(*seen, replace(known, dilution=1.0), 0.25 * tolerance_px)[2]
+    left = camera.project(moved.act(points[near])) - pixels[near]
+    fits = np.linalg.norm(left, axis=1) < tolerance_px
+    one = np.zeros(int(fits.sum()), dtype=np.int64)
+    shared = design_effect(left[fits], pixels[near][fits], one, max(camera.width, camera.height))
+    if gain < shared * (_LENT_GAIN if lent else _PART_GAIN):
         return None
     # Once more: how much the pixels count followed from the residuals of a whole photo.
-    part = replace(whole, cam_from_local=moved, camera=camera, lens_prior=prior)
-    found = refine_pose(pixels, points, part, options)
-    return found if found.inliers.sum() >= whole.inliers.sum() else None
+    told = replace(prior, dilution=shared)
+    part = replace(whole, cam_from_local=moved, camera=camera, lens_prior=told, part=True)
+    return refine_pose(pixels, points, replace(part, camera_source="estimated"), options)
 
 
 def _refine_known_lens(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtrc
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.features import Features
@@ -38,11 +39,13 @@ from reloc.localise.pose import (
     estimate_pose,
     refine_pose,
     reprojection_errors,
+    with_any_lens,
 )
 from reloc.localise.result import Evidence, LocaliseRequest
 from reloc.wire.query import CameraSource, Reason
 
 _MORE_BY_REFINING = 2  # times RANSAC's inliers
+_OTHER_LENS_RATE = 1e-3  # of photos by the lens that a map has lent
 _FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement
 
 
@@ -160,6 +163,7 @@ class _ClusterSearch:
             return []
         if _is_hopeless(len(matches), pose, self.options):
             return [self._with_evidence(pose, matches, matches)]
+        pose = self._unless_part(pose, matches)
         best = self._refined(matches, pose)
         taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
         left = Matches(feature=matches.feature[~taken], point=matches.point[~taken])
@@ -178,6 +182,27 @@ class _ClusterSearch:
         points = pairs(self.features, self.area, matches)
         found = [estimate_pose(*points, camera, source, self.options.pose) for camera, source in cameras]
         return max((pose for pose in found if pose is not None), key=lambda pose: pose.count, default=None)
+
+    def _unless_part(self, pose: PoseHypothesis, matches: Matches) -> PoseHypothesis:
+        """The pose, or that of a picture cut out of a larger one or zoomed, where more matches agree with it.
+
+        Programs cut and phones zoom, and leave EXIF as it was. Contradiction: of the matches that agree with
+        one of both lenses alone, far more than half do with the other one (sign test). A lens that a map has
+        lent, and with which most matches agree, is not asked: over flat ground others fit as well.
+        """
+        source, options = pose.camera_source, self.options.pose
+        if source == "request" or self.request.film or (source == "map" and 2 * pose.count > len(matches)):
+            return pose
+        points = pairs(self.features, self.area, matches)
+        if source != "map":
+            pose = refine_pose(*points, pose, options)
+        freed = with_any_lens(*points, pose, options)
+        self.clock.lap("pose")
+        if freed is None:
+            return pose
+        gained = int((freed.inliers & ~pose.inliers).sum())
+        lost = int((pose.inliers & ~freed.inliers).sum())
+        return freed if bdtrc(gained - 1, gained + lost, 0.5) < _OTHER_LENS_RATE else pose
 
     def _refined(self, matches: Matches, pose: PoseHypothesis) -> PoseCandidate:
         """Refine on matches looked for where the pose has them; keep that only if it agrees with more."""

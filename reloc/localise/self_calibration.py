@@ -144,6 +144,7 @@ def _step(pose: Rigid3, camera: Camera, delta: FloatArray) -> tuple[Rigid3, Came
     lens = lens_of(camera)
     moved = lens + delta[6:]
     moved[0] = np.clip(moved[0], 0.7 * lens[0], 1.4 * lens[0])  # one step's reach
+    moved[4:5] = np.clip(moved[4:5], -0.5, 0.5)  # of the second focal length over the first, less one
     return pose_step(pose, delta[:6]), with_lens(camera, moved)
 
 

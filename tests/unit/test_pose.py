@@ -85,7 +85,8 @@ def whole_and_part(
     found = estimate_pose(pixels, points, Camera.from_focal(1000, 800, 1200.0), "estimated", OPTIONS)
     assert found is not None
     whole = refine_pose(pixels, points, found, OPTIONS)
-    return whole, refined_as_part(pixels, points, whole, OPTIONS), pixels, points
+    assert whole.lens_prior is not None
+    return whole, refined_as_part(pixels, points, whole, whole.lens_prior, OPTIONS), pixels, points
 
 
 def test_a_picture_that_was_cut_out_of_a_photo_is_placed_with_the_middle_of_its_lens() -> None:

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.adjust.problem import Problem
+from featuredb.adjust.shared_noise import design_effect
 from featuredb.adjust.terms import Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian, turns_about
 from ingest.colmap.adjust import longest_side, residuals_of
 from ingest.colmap.anchored import MAPPING, FixedPoints, Lenses, block_and_marks
 from ingest.colmap.bridge import Model, with_observations
-from ingest.colmap.precision import design_effect, linearise
+from ingest.colmap.precision import linearise
 from ingest.growth.map_places import SIGMAS_95
 
 _LEAST_FREEDOM = 0.1
@@ -106,9 +107,8 @@ def photo_covariances(
     # Of an observation, with what its neighbours share and what points and poses take up of it.
     taken, count = 3 * len(block.xyz) + 6 * len(block.names), 2 * (len(block.point_of) + len(marks.xyz))
     freedom = max(1.0 - taken / count, _LEAST_FREEDOM)
-    residuals, pixels, photo_of = residuals_of(block, marks)
-    shared = design_effect(residuals, pixels, photo_of, longest_side(block.cameras))
-    variance_px2 = float((residuals**2).mean()) * shared / freedom
+    own = residuals_of(block, marks)
+    variance_px2 = float((own[0] ** 2).mean()) * design_effect(*own, longest_side(block.cameras)) / freedom
     sigma_px = max(float(np.sqrt(variance_px2)), _LEAST_PX)
     terms = Terms(
         keypoint_px=sigma_px,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
 from featuredb.adjust.problem import Problem
+from featuredb.adjust.shared_noise import design_effect
 from featuredb.adjust.terms import Block, LensPrior, Marks, Terms, surface_priors, whole_lens
 from featuredb.features.exif.read import focal_of_key
 from featuredb.geometry.arrays import FloatArray
@@ -22,7 +23,7 @@ from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from featuredb.render.cloud import PointCloud
 from ingest.colmap.adjust import AdjustOptions, lens_prior_of, longest_side, residuals_of
-from ingest.colmap.precision import design_effect, linearise
+from ingest.colmap.precision import linearise
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.outcome import Outcome
 from ingest.register.structure.projection import Registered, StructurePlacement
