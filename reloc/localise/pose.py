@@ -17,7 +17,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.stop_signals import handle_as_before
 from reloc.localise.lens_prior import LensPriors, QueryLensPrior, lens_of, pixel_jacobians, with_lens
 from reloc.localise.options import PoseOptions
-from reloc.localise.self_calibration import calibrate, covariance_from_information
+from reloc.localise.self_calibration import calibrate, covariance_from_information, score
 from reloc.wire.query import CameraSource
 
 # Of twice the logarithm of the likelihood, by three parameters: one of twenty whole photos is above, and its
@@ -141,22 +141,35 @@ def _ransac_focal(
 def with_any_lens(
     pixels: FloatArray, points: FloatArray, found: PoseHypothesis, options: PoseOptions
 ) -> PoseHypothesis | None:
-    """The pose of a picture that was cut out of a larger one or zoomed; None where there is none.
+    """The pose of a picture that was cut out of a larger one or zoomed; None for lenses other than OPENCV's.
 
     Args:
         pixels, points: as of `estimate_pose`, which has found the pose of a whole photo.
     """
-    start, pose = whole_camera(found.camera), found
-    if start.model != "OPENCV":
+    lens, lent = whole_camera(found.camera), found.camera_source == "map"
+    if lens.model != "OPENCV":
         return None
-    if found.camera_source == "map":
-        freed = _ransac_focal(start, pixels, points, options.tolerance_px(start), options)
-        if freed is None:
-            return None
-        lens = with_lens(start, np.append(freed[1].focal_px, lens_of(start)[1:]))
-        pose = replace(found, cam_from_local=freed[0], camera=lens, camera_source="estimated")
-    prior = options.lens.of_part(start, distorts=found.camera_source != "map")
-    return refine_pose(pixels, points, replace(pose, lens_prior=prior, part=True), options)
+    starts = [(found.cam_from_local, lens)]
+    zoomed = _ransac_focal(lens, pixels, points, options.tolerance_px(lens), options) if lent else None
+    if zoomed is not None:
+        starts.append((zoomed[0], with_lens(lens, np.append(zoomed[1].focal_px, lens_of(lens)[1:]))))
+    prior = options.lens.of_part(lens, distorts=not lent)
+    part = replace(found, camera_source="estimated", lens_prior=prior, part=True)
+    tries = [
+        _widened(pixels, points, replace(part, cam_from_local=cam_from_local, camera=camera), options)
+        for cam_from_local, camera in starts
+    ]
+    return max(tries, key=lambda pose: pose.count)
+
+
+def _widened(
+    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, options: PoseOptions
+) -> PoseHypothesis:
+    """Refined as long as more matches agree: from one corner over the rest of the picture."""
+    best = refine_pose(pixels, points, start, options)
+    while (further := refine_pose(pixels, points, best, options)).count > best.count:
+        best = further
+    return best
 
 
 def refine_pose(
@@ -196,7 +209,9 @@ def refined_as_part(
     """The pose of a picture cut out of a larger one, zoomed, or put into one; None: it may be a whole photo.
 
     Contradiction: the ratio of the likelihoods with any focal length and the lens's axis anywhere, and with
-    what is known of whole photos, by chi-square (Wilks), over what neighbouring residuals share.
+    what is known of whole photos, by chi-square (Wilks), over what neighbouring residuals share. Where a map
+    has lent the lens, the derivatives alone are asked before it, which takes no time: one whole photo of
+    twenty passes.
 
     Args:
         pixels, points: (m, 2), (m, 3) of all matches. whole: refined, as of a whole photo.
@@ -207,9 +222,13 @@ def refined_as_part(
     near = reprojection_errors(pixels, points, whole.camera, whole.cam_from_local) < 2.0 * tolerance_px
     seen = (pixels[near], points[near], whole.cam_from_local, whole.camera)
     prior = options.lens.of_part(whole.camera, distorts=not lent)
-    moved, camera, gain = calibrate(*seen, prior, 0.25 * tolerance_px)
+    as_whole = replace(known, dilution=1.0)
+    noise_px = 0.25 * tolerance_px
+    if lent and score(*seen, prior, noise_px) - score(*seen, as_whole, noise_px) < _PART_GAIN:
+        return None
+    moved, camera, gain = calibrate(*seen, prior, noise_px)
     if lent:
-        gain -= calibrate(*seen, replace(known, dilution=1.0), 0.25 * tolerance_px)[2]
+        gain -= calibrate(*seen, as_whole, noise_px)[2]
     left = camera.project(moved.act(points[near])) - pixels[near]
     fits = np.linalg.norm(left, axis=1) < tolerance_px
     one = np.zeros(int(fits.sum()), dtype=np.int64)

@@ -38,16 +38,40 @@ def calibrate(
     Raises:
         InvalidValueError: the camera is of another model.
     """
-    camera = with_lens(start_camera, whole_lens(lens_of(start_camera))[: len(prior.mean)])
-    problem = LensProblem(
-        pixels=pixels,
-        points=points,
-        noise_px=noise_px,
-        trust=(noise_px / measured_noise_px(pixels, points, start_pose, camera, noise_px)) ** 2,
-        prior=prior,
-    )
+    problem, camera = _problem(pixels, points, start_pose, start_camera, prior, noise_px)
     found = _minimise(problem, start_pose, camera)
     return *found, 2.0 * (problem.cost_of_pixels(start_pose, camera) - problem.cost_of_pixels(*found))
+
+
+def score(
+    pixels: FloatArray,
+    points: FloatArray,
+    pose: Rigid3,
+    camera: Camera,
+    prior: QueryLensPrior,
+    noise_px: float,
+) -> float:
+    """About twice the logarithm of how much likelier `calibrate` would make all, from the first derivatives.
+
+    Rao, Large sample tests of statistical hypotheses, 1948. Arguments as of `calibrate`.
+    """
+    problem, whole = _problem(pixels, points, pose, camera, prior, noise_px)
+    information, gradient = problem.linearise(pose, whole)
+    return float(gradient @ covariance_from_information(information) @ gradient)
+
+
+def _problem(
+    pixels: FloatArray,
+    points: FloatArray,
+    pose: Rigid3,
+    camera: Camera,
+    prior: QueryLensPrior,
+    noise_px: float,
+) -> tuple["LensProblem", Camera]:
+    """With the camera as one of as many parameters as the prior has."""
+    whole = with_lens(camera, whole_lens(lens_of(camera))[: len(prior.mean)])
+    trust = (noise_px / measured_noise_px(pixels, points, pose, whole, noise_px)) ** 2
+    return LensProblem(pixels=pixels, points=points, noise_px=noise_px, trust=trust, prior=prior), whole
 
 
 def covariance_from_information(information: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -133,3 +134,24 @@ def test_a_photos_own_position_settles_which_of_two_places_it_shows(
         assert np.linalg.norm(alone.pose.utm - found.pose.utm) < 0.5
         assert alone.own_position is not None
         assert alone.own_position.role == "contradicted"
+
+
+def test_a_zoomed_photo_is_not_believed_to_have_its_cameras_lens(
+    part: tuple[Database, IngestReport], photos: Path
+) -> None:
+    """Its middle, enlarged, with the EXIF of the whole: over a flat park it looks like a photo from below."""
+    snapshot = part[0].snapshot()
+    area = indexed(snapshot.load_map(snapshot.maps()[0].map_id))
+    for name in ("DJI_0027.JPG", "DJI_0031.JPG"):
+        data = (photos / name).read_bytes()
+        gray, told = decode_gray(data), localise_request(LocaliseWireRequest(), data, probe(data))
+        height, width = gray.shape
+        middle = gray[height // 6 : -(height // 6), width // 6 : -(width // 6)]
+        zoomed = cv2.resize(middle, (width, height), interpolation=cv2.INTER_CUBIC)
+        whole, found = (localise(picture, told, [area]) for picture in (gray, zoomed))
+        assert whole.pose is not None
+        assert whole.pose.camera_source == "map"
+        assert found.pose is not None
+        assert found.pose.camera_source == "estimated"
+        off = np.abs(found.pose.utm - whole.pose.utm)
+        assert (off <= 2.5 * np.sqrt(np.diag(found.pose.covariance)[3:])).all()
