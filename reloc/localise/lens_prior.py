@@ -95,8 +95,8 @@ class LensPriors:
         prior = wide.around(camera, camera.focal_px, self.unknown_focal_rel)
         if distorts:
             return prior
-        sigma = np.concatenate([prior.sigma[:3], _EXACT[3 : len(prior.sigma)]])
-        return replace(prior, mean=lens_of(camera), sigma=sigma)
+        mean = lens_of(camera)
+        return replace(prior, mean=mean, sigma=np.append(prior.sigma[:3], _EXACT[3 : len(mean)]))
 
     def around(self, camera: Camera, focal_px: float, focal_rel: float) -> QueryLensPrior:
         """What is known of a lens of pictures of this camera's size, whose focal length is about this."""

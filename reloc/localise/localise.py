@@ -191,10 +191,11 @@ def _decide(
     told = request.camera if request.camera_is_exact else None
     seen = _lens_as_seen(best) if told is None and best.pose.lens_prior is None else None
     known = best.pose.lens_prior or (seen and seen[1])
+    part = None
     if known and best.pose.camera_source != "request" and not best.pose.part and request.film is None:
         part = refined_as_part(pixels, points, best.pose, known, options.pose)
-        if part is not None:
-            best, seen = replace(best, pose=part, rows=best.rows[part.inliers[best.rows]]), None
+    if part is not None:
+        best, seen = replace(best, pose=part, rows=best.rows[part.inliers[best.rows]]), None
     rows = best.matches.point[best.rows]
     inliers = (pixels[best.rows], points[best.rows], best.area.point_covariance(rows))
     uncertainty = pose_uncertainty(*inliers, best.pose, options.pose)
@@ -208,9 +209,10 @@ def _decide(
     against = contradicts_prior(answer, request.prior)
     if against is not None:
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
+    cut = _OF_PART if part or best.pose.part else ""
     result = answered(
         reason=None,
-        detail=f"{best.evidence.inliers} inliers of {matches} matches{_OF_PART if best.pose.part else ''}",
+        detail=f"{best.evidence.inliers} inliers of {matches} matches{cut}",
         pose=answer,
         confidence=confidence(best.evidence, rival.inliers if rival else 0),
         inliers=best.evidence.inliers,

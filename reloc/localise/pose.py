@@ -38,7 +38,7 @@ class PoseHypothesis:
         inliers: (m,) bool over the matches that it was estimated from.
         lens_prior: what was known of the lens beforehand, where it is estimated with the pose; None: it is
             exact.
-        part: the picture was cut out of a larger one, or zoomed.
+        part: the picture was cut out of a larger one, or zoomed; said of one of a thousand whole ones.
     """
 
     cam_from_local: Rigid3
@@ -237,7 +237,7 @@ def refined_as_part(
         return None
     # Once more: how much the pixels count followed from the residuals of a whole photo.
     told = replace(prior, dilution=shared)
-    part = replace(whole, cam_from_local=moved, camera=camera, lens_prior=told, part=True)
+    part = replace(whole, cam_from_local=moved, camera=camera, lens_prior=told, part=lent)
     return refine_pose(pixels, points, replace(part, camera_source="estimated"), options)
 
 

@@ -203,3 +203,12 @@ def test_poses_are_compared_with_one_lens(new: NewPhotos, localised: dict[int, L
     assert np.linalg.norm(again.cam_from_local.center - new.poses[2].center) < 0.1
     other_size = Camera(model="SIMPLE_RADIAL", width=500, height=400, params=(450.0, 250.0, 200.0, 0.0))
     assert with_lens(localised[2], other_size) is localised[2]
+
+
+def test_a_zoomed_photo_waits(area: IndexedArea) -> None:
+    """An adjustment would take its lens for that of its camera."""
+    zoomed = CAMERA.with_focal(1.5 * CAMERA.focal_px)
+    new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, walk(1), camera=zoomed, camera_key=KEY)
+    found = localise_photo(new.photos[0], new.features_of(0).features, [area])
+    assert isinstance(found, str)
+    assert found.startswith("PART_OF_PHOTO: ")

@@ -53,11 +53,8 @@ def localise_photos(
     def one(row: int) -> LocalisedPhoto | str:
         return localise_photo(new.photos[row], new.features_of(row).features, areas)
 
-    if threads <= 1 or len(rows) < 2:
-        outcomes = dict(zip(rows, map(one, rows), strict=True))
-    else:
-        with ThreadPoolExecutor(threads, initializer=use_threads, initargs=(1,)) as pool:
-            outcomes = dict(zip(rows, pool.map(one, rows), strict=True))
+    with ThreadPoolExecutor(threads, initializer=use_threads, initargs=(1,)) as pool:
+        outcomes = dict(zip(rows, pool.map(one, rows), strict=True))
     found = {row: outcome for row, outcome in outcomes.items() if isinstance(outcome, LocalisedPhoto)}
     _LOG.info("%d of %d photos localised in %d areas", len(found), len(rows), len(areas))
     return found, {row: outcome for row, outcome in outcomes.items() if isinstance(outcome, str)}
@@ -94,6 +91,8 @@ def localise_photo(
             outcome = again
     if outcome.best is None:
         return f"{outcome.result.reason}: {outcome.result.detail}"
+    if outcome.best.pose.part:  # an adjustment would take its lens for a whole photo's
+        return "PART_OF_PHOTO: the picture was cropped or zoomed; contribute the whole photo, as it was taken"
     found = _densified(features, outcome)
     if photo.gps is not None and not by_prior:
         share = share_shown(found, outcome.best.area)

@@ -17,6 +17,7 @@ from featuredb.errors import StoreError
 from featuredb.index.area import Area
 from featuredb.index.descriptor_index import DescriptorIndex
 from featuredb.index.segment import Segment
+from featuredb.index.segment_index import SegmentIndex
 from reloc.localiser import Localiser, OnDemand
 
 _ALIGNMENT = 64
@@ -96,12 +97,16 @@ class MappedAreas:
         return localiser
 
 
+# What has a file of its own: the next localiser may have it as well.
+_SHARED = (Area, Segment, DescriptorIndex, SegmentIndex, OnDemand)
+
+
 class _Pickler(pickle.Pickler):
     whole: object  # that is written
     key_of: Callable[[object], int]
 
     def persistent_id(self, obj: object) -> int | None:
-        if obj is self.whole or not isinstance(obj, Area | Segment | DescriptorIndex | OnDemand):
+        if obj is self.whole or not isinstance(obj, _SHARED):
             return None
         return self.key_of(obj)
 
