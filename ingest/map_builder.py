@@ -1,5 +1,6 @@
 """Stage: a reconstruction and the photos' features become a map, with a place or without."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -30,6 +31,8 @@ from ingest.own_frame import own_frame_of
 from ingest.photos.photo import Photo, answered_positions
 from ingest.positions.center_priors import center_priors
 from ingest.sfm.extract import PhotoFeatures
+
+_LOG = logging.getLogger(__name__)
 
 _LEAST_POSITIONS = 3  # tell a similarity
 _MOST_PHOTOS = 1000  # whose normal equations are inverted densely
@@ -179,7 +182,13 @@ def _errors(
         for photo, c in zip(photos, model.camera_of, strict=True)
         if photo.focal_px is not None
     }
-    return map_errors(block, focal_px, positions)
+    try:
+        return map_errors(block, focal_px, positions)
+    except np.linalg.LinAlgError as error:  # as of points that lie in a camera
+        _LOG.warning(
+            "covariances of the map's photos hold its points, since not all are determined: %s", error
+        )
+        return None
 
 
 def _camera_keys(model: Model, photos: Sequence[Photo]) -> tuple[str, ...]:

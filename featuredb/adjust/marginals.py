@@ -182,6 +182,8 @@ def inverse_without_points(by_point: Any, by_shared: Any) -> FloatArray:
         across = part.T @ by_shared
         inverse = inverse_blocks((part.T @ part).tocoo(), part.shape[1] // 3)
         normal -= (across.T.tocsr() @ (inverse @ across)).toarray()
+    if (np.diag(normal) < 0.0).any():
+        raise LinAlgError("the points take more than there is, as those that lie in a camera do")
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     normal *= scale[:, None]
     normal *= scale

@@ -188,6 +188,9 @@ def _bundle(
         tolerances: of rounds of noise of positions and adjustment: how far positions are off follows from the
             shape. Without positions the last is all there is.
     """
+    _drop_bogus_lenses(reconstruction)
+    if reconstruction.num_reg_images() < 2:
+        return
     model = whole_model_of(reconstruction)
     image_ids = (model.rows + 1).tolist()
     camera_ids = sorted({reconstruction.image(i).camera_id for i in image_ids})

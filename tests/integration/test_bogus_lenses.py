@@ -8,7 +8,7 @@ import pytest
 
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap.adjust import _drop_bogus_lenses
+from ingest.colmap.adjust import AdjustOptions, Known, _bundle, _drop_bogus_lenses
 from ingest.colmap.bridge import SfmPhoto, posed, read_models
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(900.0, 500.0, 400.0, 0.01))
@@ -43,3 +43,10 @@ def test_photos_with_a_bogus_lens_are_not_registered(
     model = pycolmap.Reconstruction(str(written(tmp_path / "0", focal_px)))
     _drop_bogus_lenses(model)
     assert sorted(model.reg_image_ids()) == left
+
+
+def test_a_lens_that_ran_away_does_not_end_the_adjustment(tmp_path: Path) -> None:
+    """The photos of other lenses would be lost with it."""
+    model = pycolmap.Reconstruction(str(written(tmp_path / "0", 2e7)))
+    _bundle(model, Known(photos=()), 2.0, AdjustOptions(), (1e-4,))
+    assert sorted(model.reg_image_ids()) == [1]

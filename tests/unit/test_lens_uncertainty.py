@@ -2,18 +2,24 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import sparse
 
-from featuredb.adjust.marginals import Marginals
+import featuredb.adjust.marginals as marginals_module
+from featuredb.adjust.marginals import Marginals, inverse_without_points
 from featuredb.adjust.terms import Block
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
-from ingest.colmap.map_errors import map_errors
+from ingest.colmap.map_errors import MapErrors, map_errors
+from ingest.map_builder import _errors
+from ingest.photos.photo import Photo
 from reloc.localise.lens_prior import QueryLensPrior, seen_by_a_map
 from reloc.localise.self_calibration import calibrate
 
@@ -191,3 +197,20 @@ def test_a_map_whose_lenses_are_no_opencv_has_errors_of_poses_alone() -> None:
     assert found.lenses is None
     assert (found.modes.lenses == 0).all()
     assert np.isfinite(found.poses).all()
+
+
+def test_covariances_that_nothing_determines_do_not_end_an_ingest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A point that lies in a camera takes away more than all observations tell."""
+    by_point, by_shared = sparse.csr_matrix(1e10 * np.eye(4, 3)), sparse.csr_matrix(np.eye(4, 2) * 1e10)
+    monkeypatch.setattr(marginals_module, "inverse_blocks", lambda *_: 1.1e-20 * sparse.eye(3, format="csr"))
+    with pytest.raises(np.linalg.LinAlgError):
+        inverse_without_points(by_point, by_shared)
+
+    def undetermined(*_: object) -> MapErrors:
+        raise np.linalg.LinAlgError("a point lies in a camera")
+
+    monkeypatch.setattr("ingest.map_builder.map_errors", undetermined)
+    block = _block(4)
+    photos = [Photo(name=name, path=Path(name)) for name in block.names]
+    model = SimpleNamespace(camera_of=block.camera_of)
+    assert _errors(block, photos, model, None) is None  # type: ignore[arg-type]
