@@ -45,7 +45,7 @@ from reloc.localise.result import Evidence, LocaliseRequest
 from reloc.wire.query import CameraSource, Reason
 
 _MORE_BY_REFINING = 2  # times RANSAC's inliers
-_OTHER_LENS_RATE = 1e-3  # of photos by the lens that a map has lent
+_OTHER_LENS_RATE = 1e-3  # of whole photos that are taken for parts, if neither lens was fitted to the matches
 _FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement
 
 
