@@ -186,7 +186,7 @@ def _errors(
         return map_errors(block, focal_px, positions)
     except np.linalg.LinAlgError as error:  # as of points that lie in a camera
         _LOG.warning(
-            "covariances of the map's photos hold its points, since not all are determined: %s", error
+            "how the map may bend is not known, so its photos' stated errors are too small: %s", error
         )
         return None
 
